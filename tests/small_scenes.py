@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.degradation.downsampling import Downsampling, make_sample
+from dsr.degradation.downsampling import Downsampling, Kernel, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.sample import DepthSample, Scene
 from dsr.synthetic.raycast import rotation
@@ -12,18 +12,30 @@ from dsr.synthetic.raycast import rotation
 BALLS = [(-0.7, -0.4, 2.6, 0.4), (0.6, 0.3, 2.2, 0.35), (0.1, -0.7, 3.0, 0.3), (-0.5, 0.6, 2.4, 0.3)]
 
 
-def sample_of(disparity: Tensor, rgb: Tensor | None = None, scale: int = 4, doffs: float = 0.0) -> DepthSample:
+def sample_of(
+    disparity: Tensor, rgb: Tensor | None = None, scale: int = 4, doffs: float = 0.0, kernel: Kernel = "box"
+) -> DepthSample:
     """Return the problem of a scene with these disparities, (H, W)."""
     height, width = disparity.shape
     camera = Camera(width, height, 60.0, 55.0, 0.45 * width, 0.55 * height, doffs=doffs)
     rgb = torch.zeros(3, height, width) if rgb is None else rgb
     scene = Scene("set", "hall", rgb, camera, from_range(disparity[None], camera, "disparity"))
-    return make_sample(scene, scale, Downsampling("box"), "disparity")
+    return make_sample(scene, scale, Downsampling(kernel), "disparity")
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    """Return a generator of its own."""
+    return torch.Generator().manual_seed(seed)
+
+
+def grid(height: int, width: int) -> tuple[Tensor, ...]:
+    """Return the row and the column of each pixel, (H, W) each."""
+    return torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
 
 
 def plane(height: int = 32, width: int = 48) -> Tensor:
     """Return disparities of a plane, (H, W)."""
-    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    v, u = grid(height, width)
     return 6 + 0.05 * u - 0.03 * v
 
 
@@ -57,7 +69,7 @@ def maps(height: int, width: int, count: int = 1) -> Tensor:
 
 def plane_map(height: int, width: int, along_u: float = 0.3, along_v: float = -0.2) -> Tensor:
     """Return disparities of a plane, (1, 1, H, W)."""
-    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    v, u = grid(height, width)
     return (30 + along_u * u + along_v * v)[None, None]
 
 

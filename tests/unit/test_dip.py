@@ -1,12 +1,9 @@
 """Deep image priors: the method, its loss and its network."""
 
-import functools
 import re
-from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling, make_sample
@@ -25,7 +22,7 @@ ENOUGH = {"steps": 120, "widths": (16, 32), "skips": (4, 4), "average": 0.9, "le
 CAMERA = Camera(width=48, height=32, fx=60.0, fy=60.0, cx=23.5, cy=15.5)
 
 
-def _sample(name: str = "step", holes: Blobs | None = None, scale: int = 2) -> DepthSample:
+def _sample(name="step", holes=None, scale=2):
     """Two planes with an edge that the photo shows."""
     v, u = torch.meshgrid(torch.linspace(0, 1, 32), torch.linspace(0, 1, 48), indexing="ij")
     near = u + 0.3 * v > 0.6
@@ -34,30 +31,29 @@ def _sample(name: str = "step", holes: Blobs | None = None, scale: int = 2) -> D
     return make_sample(Scene("set", name, rgb, CAMERA, depth), scale, BOX, "orthogonal", holes=holes)
 
 
-def _prior(**settings: Any) -> DeepImagePrior:
+def _prior(**settings):
     quick = {"steps": 12, "widths": (4, 6), "skips": (2, 2), "validate_every": 0, "average": 0.5}
     return DeepImagePrior(**{"scale": 2, "downsampling": BOX, **quick, **settings})
 
 
-def _module(sample: DepthSample, **settings: Any) -> PriorOptimisation:
+def _module(sample, **settings):
     return PriorOptimisation(_prior(**settings), sample, visual=True)
 
 
-def _depth(seed: int = 3) -> Tensor:
+def _depth(seed=3):
     return 2 + torch.rand(1, 1, 32, 48, generator=torch.Generator().manual_seed(seed))
 
 
-def _changed(sample: DepthSample, **values: Any) -> DepthSample:
+def _changed(sample, **values):
     return DepthSample(**{**vars(sample), **values})
 
 
-def _error(depth: Tensor, sample: DepthSample, where: Tensor | None = None) -> float:
-    assert sample.depth is not None
+def _error(depth, sample, where=None):
     difference = (depth - sample.depth).square()
     return float((difference if where is None else difference[where]).mean().sqrt())
 
 
-def test_result_is_a_function_of_seed_and_scene_alone() -> None:
+def test_result_is_a_function_of_seed_and_scene_alone():
     a, b = _sample("a"), _sample("b")
     alone, other = _prior()(b), _prior(seed=1)(b)
     torch.manual_seed(99)
@@ -73,15 +69,14 @@ def test_result_is_a_function_of_seed_and_scene_alone() -> None:
     assert alone.dtype == b.depth_lr.dtype
 
 
-def test_result_does_not_depend_on_the_truth() -> None:
+def test_result_does_not_depend_on_the_truth():
     sample = _sample()
     settings = {"validate_every": 4, "metrics": visual_metrics}
     assert torch.equal(_prior(**settings)(sample), _prior(**settings)(_changed(sample, depth=None)))
 
 
-def test_oracle_is_the_best_validation_and_flagged() -> None:
+def test_oracle_is_the_best_validation_and_flagged():
     sample = _sample()
-    assert sample.depth is not None
     prior = _prior(oracle=True, steps=5, validate_every=1, learning_rate=0.5)
     scores = [
         float(rmse_v(SurfacePair(depth[None], sample.depth[None], CAMERA.rays()[None])))
@@ -92,33 +87,19 @@ def test_oracle_is_the_best_validation_and_flagged() -> None:
     assert (prior.flag, _prior().flag) == ("oracle", "")
 
 
-@functools.cache
-def _fitted(*, visual: bool) -> tuple[Tensor, DepthSample]:
-    """Return a result after enough steps, and its sample."""
-    sample = _sample()
-    return _prior(**ENOUGH, **({} if visual else {"data_loss": "mse", "w": 0.0}))(sample), sample
+@pytest.mark.slow
+def test_dip_approximates_two_planes_and_the_visual_loss_gives_better_normals():
+    sample, errors = _sample(), []
+    for settings in ({}, {"data_loss": "mse", "w": 0.0}):
+        depth = _prior(**ENOUGH, **settings)(sample)
+        flat = torch.full_like(depth, float(sample.depth_lr.mean()))
+        assert _error(depth, sample) < 0.25 * _error(flat, sample)
+        errors.append(float(rmse_v(SurfacePair(depth[None], sample.depth[None], CAMERA.rays()[None]))))
+    assert errors[0] < 0.8 * errors[1]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("visual", [False, True])
-def test_dip_approximates_two_planes(visual: bool) -> None:
-    depth, sample = _fitted(visual=visual)
-    flat = torch.full_like(depth, float(sample.depth_lr.mean()))
-    assert _error(depth, sample) < 0.25 * _error(flat, sample)
-
-
-@pytest.mark.slow
-def test_visual_loss_gives_better_normals() -> None:
-    errors = {}
-    for visual in (True, False):
-        depth, sample = _fitted(visual=visual)
-        assert sample.depth is not None
-        errors[visual] = float(rmse_v(SurfacePair(depth[None], sample.depth[None], CAMERA.rays()[None])))
-    assert errors[True] < 0.8 * errors[False]
-
-
-@pytest.mark.slow
-def test_holes_are_filled_better_than_with_the_nearest_values() -> None:
+def test_holes_are_filled_better_than_with_the_nearest_values():
     sample = _sample(holes=Blobs(0.15, 8))
     depth = _prior(**ENOUGH)(sample)
     assert bool(depth.isfinite().all())
@@ -128,12 +109,12 @@ def test_holes_are_filled_better_than_with_the_nearest_values() -> None:
 
 
 @pytest.mark.parametrize("steps", [3, 150])
-def test_diverging_optimisation_ends_with_advice(steps: int) -> None:
+def test_diverging_optimisation_ends_with_advice(steps):
     with pytest.raises(ValueError, match=rf"step: .* diverged by step {min(steps, 100)}; a lower method.learning_rate"):
         _prior(steps=steps, learning_rate=1e30)(_sample())
 
 
-def test_network_sees_a_mirrored_border_that_the_result_lacks() -> None:
+def test_network_sees_a_mirrored_border_that_the_result_lacks():
     sample = _sample()
     module = _module(sample, border=5)
     assert module.start.shape == (1, 35, 42, 58)
@@ -146,37 +127,24 @@ def test_network_sees_a_mirrored_border_that_the_result_lacks() -> None:
     assert wide.start.shape == (1, 35, 32 + 62, 48 + 62)
 
 
-def test_normals_of_noise_are_ignored() -> None:
+def test_normals_of_noise_are_ignored():
     clean, lines = _sample(), list[str]()
     draws = torch.randn(clean.depth_lr.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     noisy = _changed(clean, depth_lr=clean.depth_lr * (1 + 0.02 * draws))
     display = Progress()
-    display.say = lines.append  # type: ignore[method-assign, assignment]
+    display.say = lines.append
     depth = _prior(steps=3, display=display)(noisy)
     assert torch.equal(depth, _prior(steps=3, w=0.0)(noisy))
     assert re.fullmatch(r"step: without MSE_v; noise of \d\.\d+% tilts the input's normals by \d+ degrees.*", lines[0])
     assert not torch.equal(_prior(steps=3)(clean), _prior(steps=3, w=0.0)(clean))
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"steps": 0}, {"learning_rate": 0.0}, {"average": 1.0}, {"widths": (4, 0)}, {"widths": (2,)}, {"border": -1},
-        {"validate_every": -1}, {"validate_every": 0, "oracle": True}, {"input_noise": -1.0}, {"data_loss": "l2"},
-        {"w": -1.0}, {"w_intensity": -0.1}, {"visual": "dssim", "w": 0.0}, {"visual": "ssim"}, {"precision": "int8"},
-    ],
-)  # fmt: skip
-def test_options_out_of_range_are_refused(settings: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=f"^{next(iter(settings))}: expected"):
-        _prior(**settings)
-
-
-def test_map_too_small_for_the_visual_loss_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"^visual: dssim expects maps of at least 7 x 7 pixels, got 4 x 6$"):
+def test_map_too_small_for_the_visual_loss_is_refused():
+    with pytest.raises(ValueError, match=r"^visual: dssim expects"):
         _module(_sample(scale=8), visual="dssim", scale=8)
 
 
-def test_loss_is_the_sum_of_its_terms_on_low_resolution_maps() -> None:
+def test_loss_is_the_sum_of_its_terms_on_low_resolution_maps():
     module = _module(_sample(), w=0.7, w_intensity=0.3)
     depth, intensity = _depth(), torch.rand(1, 1, 32, 48)
     blocks = depth.view(1, 1, 16, 2, 24, 2).mean(dim=(3, 5))
@@ -194,7 +162,7 @@ def test_loss_is_the_sum_of_its_terms_on_low_resolution_maps() -> None:
     assert plain.keys() == {"loss", "data_mse"}
 
 
-def test_automatic_weight_makes_a_loss_as_large_as_mse_v_for_a_smoothed_input() -> None:
+def test_automatic_weight_makes_a_loss_as_large_as_mse_v_for_a_smoothed_input():
     sample = _sample()
     depth_lr = sample.depth_lr[None].float()
     pair = SurfacePair(mean3x3(depth_lr), depth_lr, sample.camera_lr.rays(dtype=torch.float32)[None])
@@ -205,63 +173,48 @@ def test_automatic_weight_makes_a_loss_as_large_as_mse_v_for_a_smoothed_input() 
 
 
 @pytest.mark.parametrize("loss", [{"data_loss": "mse", "w": 0.0}, {"data_loss": "lap1"}])
-def test_depth_under_a_hole_does_not_matter(loss: dict[str, Any]) -> None:
+def test_depth_under_a_hole_does_not_matter(loss):
     sample = _sample()
-    depth_lr = sample.depth_lr.clone()
-    depth_lr[:, 4:9, 6:14] = torch.nan
-    depth = _depth().requires_grad_()
-    module = _module(_changed(sample, depth_lr=depth_lr), w_intensity=0.0, **loss)
-    module.loss_terms(depth, torch.rand(1, 1, 32, 48))["loss"].backward()
-    gradient = depth.grad
-    assert gradient is not None
-    assert bool(gradient.isfinite().all())
-    assert float(gradient[..., 8:18, 12:28].abs().max()) == 0
-    assert float(gradient[..., 20:, :].abs().min()) > 0
-
-
-def test_loss_is_finite_where_no_two_neighbours_are_valid() -> None:
-    depth_lr = torch.full((1, 16, 24), torch.nan, dtype=torch.float64)
-    depth_lr[:, ::3, ::3] = 2.5
-    depth = _depth().requires_grad_()
-    terms = _module(_changed(_sample(), depth_lr=depth_lr)).loss_terms(depth, torch.rand(1, 1, 32, 48))
-    terms["loss"].backward()
-    assert bool(terms["loss"].isfinite())
-    assert bool(depth.grad.isfinite().all())  # type: ignore[union-attr]
+    pierced, sparse = sample.depth_lr.clone(), torch.full_like(sample.depth_lr, torch.nan)
+    pierced[:, 4:9, 6:14] = torch.nan
+    sparse[:, ::3, ::3] = 2.5  # no two neighbours are valid
+    for depth_lr in (pierced, sparse):
+        depth = _depth().requires_grad_()
+        module = _module(_changed(sample, depth_lr=depth_lr), w_intensity=0.0, **loss)
+        module.loss_terms(depth, torch.rand(1, 1, 32, 48))["loss"].backward()
+        assert bool(depth.grad.isfinite().all())
+        if depth_lr is pierced:
+            assert float(depth.grad[..., 8:18, 12:28].abs().max()) == 0
+            assert float(depth.grad[..., 20:, :].abs().min()) > 0
 
 
 @pytest.mark.parametrize("shape", [(1, 3, 1, 1), (2, 3, 4, 5), (1, 1, 7, 1)])
 @pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
-def test_doubling_is_bilinear_interpolation(shape: tuple[int, ...], layout: torch.memory_format) -> None:
+def test_doubling_is_bilinear_interpolation(shape, layout):
     x = torch.rand(shape, dtype=torch.float64).to(memory_format=layout)
     expected = functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
     torch.testing.assert_close(upsample_2x(x), expected)
 
 
 @pytest.mark.parametrize("size", [(3, 4), (1, 2)])
-def test_gradient_of_doubling_agrees_with_finite_differences(size: tuple[int, int]) -> None:
+def test_gradient_of_doubling_agrees_with_finite_differences(size):
     x = torch.rand(1, 2, *size, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(upsample_2x, x)
 
 
-@pytest.mark.parametrize(("height", "width"), [(32, 48), (37, 50)])
-def test_output_has_the_size_of_the_input(height: int, width: int) -> None:
-    net = SkipNet(5, 2, (4, 6, 8), (2, 2, 2))
-    assert net(torch.rand(1, 5, height, width)).shape == (1, 2, height, width)
-
-
-def test_network_is_the_hourglass_of_ulyanov_et_al() -> None:
+def test_network_is_the_hourglass_of_ulyanov_et_al():
     """Against a plain construction from their supplementary material: two levels, written out."""
     torch.manual_seed(0)
-    net: Any = SkipNet(3, 2, (4, 6), (1, 2)).double()
+    net = SkipNet(3, 2, (4, 6), (1, 2)).double()
     x = torch.rand(1, 3, 8, 12, dtype=torch.float64)
 
-    def block(y: Tensor, layer: Any) -> Tensor:
+    def block(y, layer):
         convolution, norm, _ = layer
         weight, bias, stride = convolution.weight, convolution.bias, convolution.stride
         y = functional.conv2d(y, weight, bias, stride, convolution.kernel_size[0] // 2)
         return functional.leaky_relu(normal(y, norm), 0.2)
 
-    def normal(y: Tensor, norm: Any) -> Tensor:
+    def normal(y, norm):
         mean, variance = y.mean((0, 2, 3), keepdim=True), y.var((0, 2, 3), unbiased=False, keepdim=True)
         scaled = (y - mean) / (variance + 1e-5).sqrt()
         return scaled * norm.weight.view(1, -1, 1, 1) + norm.bias.view(1, -1, 1, 1)
@@ -275,7 +228,7 @@ def test_network_is_the_hourglass_of_ulyanov_et_al() -> None:
     torch.testing.assert_close(net(x), functional.conv2d(y, net.last.weight, net.last.bias))
 
 
-def test_output_is_finer_than_bfloat16_even_if_the_convolutions_are_not() -> None:
+def test_output_is_finer_than_bfloat16_even_if_the_convolutions_are_not():
     torch.manual_seed(0)
     net, x = SkipNet(4, 1, (8, 8), (2, 2)), torch.rand(1, 4, 64, 64)
     with torch.autocast("cpu", torch.bfloat16):
@@ -286,8 +239,8 @@ def test_output_is_finer_than_bfloat16_even_if_the_convolutions_are_not() -> Non
 
 
 @pytest.mark.parametrize(
-    ("height", "width", "most", "levels"),
-    [(512, 512, 5, 5), (32, 512, 5, 4), (4, 4, 5, 1), (2, 2, 5, 1), (64, 64, 2, 2)],
+    ("height", "width", "most", "levels"), [(512, 512, 5, 5), (32, 512, 5, 4), (2, 2, 5, 1), (64, 64, 2, 2)]
 )
-def test_small_image_has_fewer_levels(height: int, width: int, most: int, levels: int) -> None:
+def test_small_image_has_fewer_levels(height, width, most, levels):
     assert levels_for(height, width, most) == levels
+    assert SkipNet(5, 2, (4, 6, 8), (2, 2, 2))(torch.rand(1, 5, 37, 50)).shape == (1, 2, 37, 50)

@@ -2,13 +2,12 @@
 
 import math
 from dataclasses import replace
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
-from torch import Tensor
 
 from dsr.degradation.downsampling import (
     Downsampling,
@@ -18,11 +17,11 @@ from dsr.degradation.downsampling import (
     scene_generator,
 )
 from dsr.degradation.noise import GaussianMultiplicative
-from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType, to_range
+from dsr.geometry.camera import RANGE_TYPES, Camera, to_range
 from dsr.sample import Scene
 from dsr.utils.ratios import SCALES
 
-KERNELS: tuple[Kernel, ...] = get_args(Kernel)
+KERNELS = get_args(Kernel)
 ASKED_AND_METHOD = [*((None, method) for method in RANGE_TYPES), ("perspective", "disparity")]
 CENTRED = tuple(kernel for kernel in KERNELS if kernel != "nearest")
 CAMERA = Camera(width=48, height=32, fx=60.0, fy=55.0, cx=21.3, cy=17.9)
@@ -30,16 +29,16 @@ BOX = Downsampling("box")
 STEREO = Camera(width=48, height=32, fx=60.0, fy=55.0, cx=21.3, cy=17.9, baseline=0.12, doffs=1.7)
 
 
-def _values(height: int, width: int, seed: int = 0) -> Tensor:
+def _values(height, width, seed=0):
     return torch.from_numpy(np.random.default_rng(seed).uniform(1.0, 3.0, (1, height, width)))
 
 
-def _scene(depth: Tensor | None, camera: Camera = CAMERA, measured: dict[float, Tensor] | None = None) -> Scene:
+def _scene(depth, camera=CAMERA, measured=None):
     rgb = torch.linspace(0, 1, 3 * camera.height * camera.width).view(3, camera.height, camera.width)
     return Scene("set", "hall", rgb, camera, depth, measured or {})
 
 
-def _profile(kernel: str, x: float, sigma: float = 0.5) -> float:
+def _profile(kernel, x, sigma=0.5):
     """Return the weight at a distance of x low-resolution pixels: textbook formulas, one number at a time."""
     x = abs(x)
     if kernel == "box":
@@ -53,7 +52,7 @@ def _profile(kernel: str, x: float, sigma: float = 0.5) -> float:
     return -0.5 * x**3 + 2.5 * x**2 - 4 * x + 2 if x < 2 else 0.0
 
 
-def _slow(values: np.ndarray, kernel: str, scale: int, sigma: float = 0.5) -> np.ndarray:
+def _slow(values, kernel, scale, sigma=0.5):
     """Downsample one (H, W) map with holes, weight by weight, as the docstring of Downsampling says."""
     height, width = values.shape
     known = np.isfinite(values)
@@ -71,26 +70,22 @@ def _slow(values: np.ndarray, kernel: str, scale: int, sigma: float = 0.5) -> np
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_box_is_the_mean_of_the_block(scale: int) -> None:
+def test_box_is_the_mean_of_the_block_and_nearest_the_pixel_at_its_half_with_its_hole(scale):
     values = _values(32, 48)
     expected = values.numpy().reshape(1, 32 // scale, scale, 48 // scale, scale).mean(axis=(2, 4))
-    np.testing.assert_allclose(Downsampling("box")(values, scale).numpy(), expected, rtol=1e-13)
-
-
-@pytest.mark.parametrize("scale", SCALES)
-def test_nearest_is_the_pixel_at_half_a_block_and_keeps_its_hole(scale: int) -> None:
-    values = _values(32, 48)
+    np.testing.assert_allclose(BOX(values, scale).numpy(), expected, rtol=1e-13)
     values[0, scale // 2, scale // 2] = torch.nan
     coarse = Downsampling("nearest")(values, scale).numpy()
     np.testing.assert_array_equal(coarse, values.numpy()[:, scale // 2 :: scale, scale // 2 :: scale])
     assert np.isnan(coarse[0, 0, 0])
+    assert bool(Downsampling("gaussian", sigma=0.1)(torch.ones(1, 32, 32), scale).isfinite().all())
 
 
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize(
     ("kernel", "filter_"), [("bilinear", Image.Resampling.BILINEAR), ("bicubic", Image.Resampling.BICUBIC)]
 )
-def test_bilinear_and_bicubic_equal_pillow(kernel: Kernel, filter_: Image.Resampling, scale: int) -> None:
+def test_bilinear_and_bicubic_equal_pillow(kernel, filter_, scale):
     values = _values(32, 48)
     image = Image.fromarray(values[0].numpy().astype(np.float32))
     expected = np.asarray(image.resize((48 // scale, 32 // scale), filter_))
@@ -98,7 +93,7 @@ def test_bilinear_and_bicubic_equal_pillow(kernel: Kernel, filter_: Image.Resamp
 
 
 @pytest.mark.parametrize("sigma", [0.3, 0.5, 0.7])
-def test_gaussian_equals_its_formula(sigma: float) -> None:
+def test_gaussian_equals_its_formula(sigma):
     values = _values(12, 20)
     expected = _slow(values[0].numpy(), "gaussian", 4, sigma)
     np.testing.assert_allclose(Downsampling("gaussian", sigma)(values, 4)[0].numpy(), expected, rtol=1e-12)
@@ -106,7 +101,7 @@ def test_gaussian_equals_its_formula(sigma: float) -> None:
 
 @pytest.mark.parametrize("kernel", CENTRED)
 @pytest.mark.parametrize("fraction", [0.05, 0.8])
-def test_holes_are_left_out_of_the_average(kernel: Kernel, fraction: float) -> None:
+def test_holes_are_left_out_of_the_average(kernel, fraction):
     values = _values(12, 20)
     values[torch.from_numpy(np.random.default_rng(1).random((1, 12, 20)) < fraction)] = torch.nan
     values[0, :4, 4:8] = torch.nan  # a block without a known pixel
@@ -116,7 +111,7 @@ def test_holes_are_left_out_of_the_average(kernel: Kernel, fraction: float) -> N
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_batch_is_downsampled_map_by_map(kernel: Kernel) -> None:
+def test_batch_is_downsampled_map_by_map(kernel):
     values = torch.stack((_values(8, 12, 0), _values(8, 12, 1)))
     values[1, 0, 2, 3] = torch.nan
     together = Downsampling(kernel)(values, 2)
@@ -126,36 +121,31 @@ def test_batch_is_downsampled_map_by_map(kernel: Kernel) -> None:
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("holes", [False, True])
-def test_gradient_of_downsampling_is_that_of_its_value(kernel: Kernel, holes: bool) -> None:
+def test_gradient_of_downsampling_is_that_of_its_value(kernel, holes):
     values = _values(4, 6)
     mask = torch.ones_like(values, dtype=torch.bool)
     if holes:
         mask[0, :2, :2] = False
         mask[0, 3, 4] = False
 
-    def known_part(values: Tensor) -> Tensor:
+    def known_part(values):
         coarse = Downsampling(kernel)(torch.where(mask, values, torch.nan), 2)
         return coarse[coarse.isfinite()]
 
     assert torch.autograd.gradcheck(known_part, values.requires_grad_())
 
 
-def test_invalid_model_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"^kernel: expected one of box, nearest, bilinear, bicubic, gaussian, got"):
-        Downsampling("lanczos")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="downsampling: expected a size divisible by 4, got 8 x 10"):
+def test_size_that_the_scale_does_not_divide_is_refused():
+    with pytest.raises(ValueError, match="downsampling: expected"):
         BOX(_values(8, 10), 4)
-    for sigma in (0.0, 0.09, -1.0, math.nan):
-        with pytest.raises(ValueError, match=r"^sigma: expected at least 0\.1"):
-            Downsampling("gaussian", sigma)
 
 
-def _points(depth: Tensor, camera: Camera) -> Tensor:
+def _points(depth, camera):
     return depth * camera.rays()
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_sphere_around_the_camera_is_reproduced_in_perspective_depth(kernel: Kernel) -> None:
+def test_sphere_around_the_camera_is_reproduced_in_perspective_depth(kernel):
     sphere = (2.0 / CAMERA.ray_lengths())[None]
     for scale in SCALES:
         sample = make_sample(_scene(sphere), scale, Downsampling(kernel), "perspective")
@@ -165,7 +155,7 @@ def test_sphere_around_the_camera_is_reproduced_in_perspective_depth(kernel: Ker
 
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_low_resolution_camera_has_the_points_of_a_tilted_plane(kernel: Kernel, camera: Camera) -> None:
+def test_low_resolution_camera_has_the_points_of_a_tilted_plane(kernel, camera):
     normal = torch.tensor([0.3, -0.4, -1.0], dtype=torch.float64)[:, None, None]
     tilted = -2.0 / (normal * camera.rays()).sum(dim=0, keepdim=True)  # its disparity is linear in u and v
     narrow = kernel in ("box", "nearest")
@@ -178,7 +168,7 @@ def test_low_resolution_camera_has_the_points_of_a_tilted_plane(kernel: Kernel, 
 
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
 @pytest.mark.parametrize(("asked", "method"), ASKED_AND_METHOD)
-def test_average_is_taken_in_the_range_type(camera: Camera, asked: RangeType | None, method: RangeType) -> None:
+def test_average_is_taken_in_the_range_type(camera, asked, method):
     depth = _values(32, 48)
     sample = make_sample(_scene(depth, camera), 4, Downsampling("box", range_type=asked), method)
     z = depth.numpy()[0]
@@ -187,7 +177,7 @@ def test_average_is_taken_in_the_range_type(camera: Camera, asked: RangeType | N
     i, j = np.mgrid[:8, :12]
     coarse_lengths = np.sqrt(((4 * j + 1.5 - 21.3) / 60) ** 2 + ((4 * i + 1.5 - 17.9) / 55) ** 2 + 1)
 
-    def mean(x: np.ndarray) -> np.ndarray:
+    def mean(x):
         return x.reshape(8, 4, 12, 4).mean(axis=(1, 3))
 
     expected = {
@@ -198,47 +188,34 @@ def test_average_is_taken_in_the_range_type(camera: Camera, asked: RangeType | N
     np.testing.assert_allclose(sample.depth_lr[0].numpy(), expected, rtol=1e-12)
 
 
-def test_sample_has_the_scenes_data() -> None:
-    scene = _scene(_values(32, 48))
-    sample = make_sample(scene, 4, Downsampling("box"), "perspective")
-    assert (sample.dataset, sample.scene, sample.scale, sample.notes) == ("set", "hall", 4, ())
-    assert sample.camera == CAMERA
-    assert sample.camera_lr == CAMERA.rescale(12, 8)
-    assert torch.equal(sample.rgb, scene.rgb)
-    assert sample.depth is scene.depth
-
-
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_size_that_the_scale_does_not_divide_is_cropped_with_a_note(kernel: Kernel) -> None:
-    camera = Camera(width=50, height=35, fx=60.0, fy=55.0, cx=21.3, cy=17.9)
-    scene = _scene(_values(35, 50), camera)
-    assert scene.depth is not None
+def test_sample_has_the_scenes_data_cropped_with_a_note_to_a_size_that_the_scale_divides(kernel):
+    scene = replace(_scene(_values(35, 50), replace(CAMERA, width=50, height=35)), notes=("not metric",))
     sample = make_sample(scene, 4, Downsampling(kernel), "perspective")
-    assert sample.notes == ("cropped from 35 x 50 to 32 x 48, which 4 divides",)
+    assert (sample.dataset, sample.scene, sample.scale) == ("set", "hall", 4)
+    assert sample.notes == ("not metric", "cropped from 35 x 50 to 32 x 48, which 4 divides")
     assert sample.camera == CAMERA
     assert torch.equal(sample.rgb, scene.rgb[:, :32, :48])
-    assert sample.depth is not None
     assert torch.equal(sample.depth, scene.depth[:, :32, :48])
     whole = make_sample(_scene(scene.depth[:, :32, :48]), 4, Downsampling(kernel), "perspective")
     torch.testing.assert_close(sample.depth_lr, whole.depth_lr, rtol=0, atol=0)
-    assert sample.camera_lr == whole.camera_lr
+    assert (whole.camera_lr, whole.notes) == (sample.camera_lr, ())
 
 
 @pytest.mark.parametrize("range_type", RANGE_TYPES)
-def test_holes_of_the_scene_are_left_out_of_its_sample(range_type: RangeType) -> None:
+def test_holes_of_the_scene_are_left_out_of_its_sample(range_type):
     depth = torch.full((1, 32, 48), 2.0, dtype=torch.float64)
     depth[0, :4, 4:8] = torch.nan
     depth[0, 10, 13] = torch.nan
     sample = make_sample(_scene(depth, STEREO), 4, Downsampling("box"), range_type)
     assert (~sample.mask_lr).nonzero().tolist() == [[0, 0, 1]]
-    assert sample.depth is not None
     assert int(sample.depth.isnan().sum()) == 17
     if range_type != "perspective":
         torch.testing.assert_close(sample.depth_lr[sample.mask_lr].unique(), torch.tensor([2.0]).double())
 
 
 @pytest.mark.parametrize("range_type", RANGE_TYPES)
-def test_bicubic_undershoot_below_zero_is_a_hole(range_type: RangeType) -> None:
+def test_bicubic_undershoot_below_zero_is_a_hole(range_type):
     depth = torch.full((1, 32, 48), 40.0, dtype=torch.float64)
     depth[..., :22] = 0.1
     sample = make_sample(_scene(depth), 4, Downsampling("bicubic"), range_type)
@@ -247,7 +224,7 @@ def test_bicubic_undershoot_below_zero_is_a_hole(range_type: RangeType) -> None:
 
 
 @pytest.mark.parametrize(("size", "scale", "ratio"), [((8, 12), 4, 4), ((32, 48), "native", 1)])
-def test_measured_map_is_used_unchanged(size: tuple[int, int], scale: Any, ratio: int) -> None:
+def test_measured_map_is_used_unchanged(size, scale, ratio):
     measured = _values(*size)
     measured[0, 1, 1] = torch.nan
     sample = make_sample(_scene(None, measured={ratio: measured}), scale, Measured(), "disparity")
@@ -257,25 +234,23 @@ def test_measured_map_is_used_unchanged(size: tuple[int, int], scale: Any, ratio
 
 
 @pytest.mark.parametrize("scale", [2.6667, 2.65, "native"])
-def test_measured_map_at_any_ratio_covers_the_whole_photo(scale: Any) -> None:
+def test_measured_map_at_any_ratio_covers_the_whole_photo(scale):
     camera = Camera(width=16, height=11, fx=9.0, fy=9.0, cx=7.5, cy=5.0)
     sample = make_sample(_scene(None, camera, {16 / 6: _values(4, 6)}), scale, Measured(), "disparity")
     assert (sample.camera, sample.camera_lr, sample.scale) == (camera, camera.rescale(6, 4), 16 / 6)
     assert sample.notes == ()
 
 
-def test_native_scale_needs_exactly_one_measured_map() -> None:
-    both = {1: _values(32, 48), 4: _values(8, 12)}
-    with pytest.raises(ValueError, match=r"^hall: .*scale=native expects .* exactly one, the scene has x1, x4; give "):
-        make_sample(_scene(None, measured=both), "native", Measured(), "disparity")
-    with pytest.raises(ValueError, match=r"^hall: .*scale=native expects .* exactly one, there is none$"):
-        make_sample(_scene(_values(32, 48)), "native", Measured(), "disparity")
-    with pytest.raises(ValueError, match=r"^scale: expected one of 2, 4, 8, 16, got native$"):
-        make_sample(_scene(_values(32, 48)), "native", Downsampling("box"), "disparity")
+@pytest.mark.parametrize(
+    ("measured", "message"), [({1: _values(32, 48), 4: _values(8, 12)}, "the scene has x1, x4"), ({}, "there is none")]
+)
+def test_native_scale_needs_exactly_one_measured_map(measured, message):
+    with pytest.raises(ValueError, match=f"^hall: .*scale=native expects .*{message}"):
+        make_sample(_scene(None if measured else _values(32, 48), measured=measured), "native", Measured(), "disparity")
 
 
 @pytest.mark.parametrize("scale", [0, 2.63, 2.7, math.nan])
-def test_ratio_that_no_measured_map_has_is_refused(scale: float) -> None:
+def test_ratio_that_no_measured_map_has_is_refused(scale):
     camera = Camera(width=16, height=11, fx=9.0, fy=9.0, cx=7.5, cy=5.0)
     with pytest.raises(ValueError, match=r"expects a low-resolution map at x.*, the scene has x2.667"):
         make_sample(_scene(None, camera, {16 / 6: _values(4, 6)}), scale, Measured(), "disparity")
@@ -287,27 +262,20 @@ SMALL = Camera(48, 7, 60.0, 55.0, 21.3, 3.0)
 @pytest.mark.parametrize(
     ("scene", "scale", "downsampling", "range_type", "message"),
     [
-        *((_scene(_values(32, 48)), scale, BOX, "disparity", f"scale: .* got {scale}$") for scale in (0, 1, 3, 32)),
-        (_scene(_values(7, 48), SMALL), 8, BOX, "disparity", "hall: expected at least 8 x 8 pixels"),
+        *((_scene(_values(32, 48)), scale, BOX, "disparity", "scale: expected") for scale in (0, 1, 3, 32, "native")),
+        (_scene(_values(7, 48), SMALL), 8, BOX, "disparity", "hall: expected at least 8 x 8"),
         (_scene(_values(32, 48)), 4, BOX, "inverse", "range_type: "),
-        (_scene(None, measured={4: _values(8, 12)}), 4, BOX, "disparity", "hall: expected a high-resolution depth"),
+        (_scene(None, measured={4: _values(8, 12)}), 4, BOX, "disparity", "hall: expected a high-resolution"),
         (_scene(None, measured={4: _values(8, 12)}), 8, Measured(), "disparity", "hall: .* at x8, the scene has x4"),
         (_scene(_values(32, 48)), 4, Measured(), "disparity", "hall: .* at x4, the scene has none"),
     ],
 )
-def test_sample_that_cannot_be_made_is_refused(
-    scene: Scene, scale: int, downsampling: Any, range_type: Any, message: str
-) -> None:
+def test_sample_that_cannot_be_made_is_refused(scene, scale, downsampling, range_type, message):
     with pytest.raises(ValueError, match=f"^{message}"):
         make_sample(scene, scale, downsampling, range_type)
 
 
-def test_smallest_sigma_reaches_a_pixel_at_every_scale() -> None:
-    for scale in SCALES:
-        assert bool(Downsampling("gaussian", sigma=0.1)(torch.ones(1, 32, 32), scale).isfinite().all())
-
-
-def test_measured_map_of_an_indivisible_size_is_that_of_the_cropped_photo() -> None:
+def test_measured_map_of_an_indivisible_size_is_that_of_the_cropped_photo():
     camera = Camera(width=23, height=21, fx=30.0, fy=30.0, cx=11.0, cy=10.0)
     measured = torch.full((1, 5, 5), 2.0, dtype=torch.float64)
     scene = Scene("test", "odd", torch.rand(3, 21, 23), camera, measured={4: measured})
@@ -321,19 +289,14 @@ def test_measured_map_of_an_indivisible_size_is_that_of_the_cropped_photo() -> N
 # Noise
 
 
-def _wall(name: str = "hall", dataset: str = "set") -> Scene:
+def _wall(name="hall", dataset="set"):
     depth = torch.full((1, 320, 480), 2.0, dtype=torch.float64)
     return Scene(dataset, name, torch.rand(3, 320, 480), Camera(480, 320, 60.0, 55.0, 240.0, 160.0), depth)
 
 
-BOX4: dict[str, Any] = {"scale": 4, "downsampling": Downsampling("box")}
-
-
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
 @pytest.mark.parametrize(("asked", "method"), ASKED_AND_METHOD)
-def test_noise_is_one_plus_std_times_the_draws_in_the_averaged_range_type(
-    camera: Camera, asked: RangeType | None, method: RangeType
-) -> None:
+def test_noise_is_one_plus_std_times_the_draws_in_the_averaged_range_type(camera, asked, method):
     noisy, clean = (
         make_sample(_scene(_values(32, 48), camera), 4, Downsampling("box", range_type=asked), method, noise, generator)
         for noise, generator in ((GaussianMultiplicative(0.03), torch.Generator().manual_seed(3)), (None, 0))
@@ -343,7 +306,7 @@ def test_noise_is_one_plus_std_times_the_draws_in_the_averaged_range_type(
     torch.testing.assert_close(one, other * (1 + 0.03 * draws), rtol=1e-10, atol=1e-10)
 
 
-def test_noise_beyond_the_camera_makes_a_hole() -> None:
+def test_noise_beyond_the_camera_makes_a_hole():
     scene = _scene(torch.full((1, 32, 48), 2.0, dtype=torch.float64))
     for range_type in RANGE_TYPES:
         sample = make_sample(scene, 2, Downsampling("box"), range_type, GaussianMultiplicative(0.9))
@@ -352,31 +315,16 @@ def test_noise_beyond_the_camera_makes_a_hole() -> None:
         assert torch.equal(sample.mask_lr, 1 + 0.9 * draws > 0)
 
 
-def test_noise_is_a_function_of_seed_scene_names_and_scale() -> None:
-    def coarse(scene: Scene, seed: int = 0, scale: int = 4) -> Tensor:
+def test_noise_is_a_function_of_seed_scene_names_and_scale_or_goes_on_with_a_generator():
+    def coarse(scene, seed=0, scale=4):
         noise = GaussianMultiplicative(0.01)
-        return make_sample(scene, scale, Downsampling("box"), "disparity", noise, seed).depth_lr.flatten()[:300]
+        return make_sample(scene, scale, BOX, "disparity", noise, seed).depth_lr.flatten()[:300]
 
     first = coarse(_wall())
     assert torch.equal(first, coarse(_wall()))
-    for other in (coarse(_wall("attic")), coarse(_wall(dataset="b")), coarse(_wall(), 1), coarse(_wall(), 0, 8)):
-        assert abs(float(torch.corrcoef(torch.stack((first, other)))[0, 1])) < 0.25
-
-
-def test_own_generator_continues_from_sample_to_sample() -> None:
-    generator, noise = torch.Generator().manual_seed(5), GaussianMultiplicative(0.01)
-    first, second = (
-        make_sample(_wall(), **BOX4, range_type="disparity", noise=noise, generator=generator) for _ in "ab"
-    )
-    assert not torch.equal(first.depth_lr, second.depth_lr)
-    again = make_sample(
-        _wall(), **BOX4, range_type="disparity", noise=noise, generator=torch.Generator().manual_seed(5)
-    )
-    assert torch.equal(first.depth_lr, again.depth_lr)
-
-
-def test_scene_notes_are_passed_to_its_samples() -> None:
-    odd = replace(CAMERA, width=50)
-    known = replace(_scene(_values(32, 50), odd), notes=("not metric",))
-    notes = make_sample(known, 4, Downsampling("box"), "orthogonal").notes
-    assert notes == ("not metric", "cropped from 32 x 50 to 32 x 48, which 4 divides")
+    others = coarse(_wall("attic")), coarse(_wall(dataset="b")), coarse(_wall(), 1), coarse(_wall(), 0, 8)
+    generator = torch.Generator().manual_seed(5)
+    own, next_one = coarse(_wall(), generator), coarse(_wall(), generator)
+    assert torch.equal(own, coarse(_wall(), torch.Generator().manual_seed(5)))
+    for one, other in (*((first, each) for each in others), (own, next_one)):
+        assert abs(float(torch.corrcoef(torch.stack((one, other)))[0, 1])) < 0.25

@@ -1,34 +1,29 @@
 """Maps of another program as a method: read in every format and quantity, fitted without the truth, and refused."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 import torch
 from small_scenes import plane, sample_of
-from torch import Tensor
 
 from dsr.methods.external import External, fit_line
-from dsr.sample import DepthSample
 
 
 @pytest.fixture
-def sample() -> DepthSample:
+def sample():
     return sample_of(plane() + 3 * (plane() > 6.5), scale=4)
 
 
-def full(sample: DepthSample) -> Tensor:
+def full(sample):
     """Return the true depth."""
-    assert sample.depth is not None
     return sample.depth
 
 
-def truth(sample: DepthSample) -> np.ndarray:
+def truth(sample):
     return full(sample)[0].numpy()
 
 
-def write(folder: Path, name: str, values: np.ndarray) -> None:
+def write(folder, name, values):
     """Write a map with NumPy or OpenCV alone."""
     path = folder / name
     if path.suffix == ".npy":
@@ -53,10 +48,8 @@ def write(folder: Path, name: str, values: np.ndarray) -> None:
         ("hall.npy", np.float32, "cm", 1e-6),
     ],
 )
-def test_map_is_read_in_metres(
-    sample: DepthSample, tmp_path: Path, name: str, kind: type, unit: str | float | None, tolerance: float
-) -> None:
-    metres = {"mm": 1e-3, "cm": 1e-2, None: 1.0}.get(unit, unit)  # type: ignore[arg-type]
+def test_map_is_read_in_metres(sample, tmp_path, name, kind, unit, tolerance):
+    metres = {"mm": 1e-3, "cm": 1e-2, None: 1.0}.get(unit, unit)
     values = truth(sample) / metres
     write(tmp_path, name, (values.round() if np.issubdtype(kind, np.integer) else values).astype(kind))
     depth = External(str(tmp_path), unit=unit)(sample)
@@ -64,7 +57,7 @@ def test_map_is_read_in_metres(
     assert float((depth - full(sample)).abs().max()) <= tolerance
 
 
-def quantity(sample: DepthSample, name: str) -> Tensor:
+def quantity(sample, name):
     """Return the true map in a quantity, by its definition."""
     camera, depth = sample.camera, full(sample).double()
     v, u = torch.meshgrid(torch.arange(32).double(), torch.arange(48).double(), indexing="ij")
@@ -73,7 +66,7 @@ def quantity(sample: DepthSample, name: str) -> Tensor:
 
 
 @pytest.mark.parametrize("name", ["perspective", "disparity", "inverse"])
-def test_quantity_is_converted(sample: DepthSample, tmp_path: Path, name: str) -> None:
+def test_quantity_is_converted(sample, tmp_path, name):
     write(tmp_path, "hall.npy", quantity(sample, name)[0].numpy())
     torch.testing.assert_close(External(str(tmp_path), range_type=name)(sample), sample.depth)
     write(tmp_path, "hall.npy", 10 * truth(sample))  # unlikely, but wanted
@@ -81,9 +74,7 @@ def test_quantity_is_converted(sample: DepthSample, tmp_path: Path, name: str) -
 
 
 @pytest.mark.parametrize(("name", "gain", "shift"), [("inverse", 7.0, -0.5), ("disparity", 0.01, 2.0)])
-def test_relative_map_is_fitted_to_the_coarse_one_without_the_truth(
-    sample: DepthSample, tmp_path: Path, name: str, gain: float, shift: float
-) -> None:
+def test_relative_map_is_fitted_to_the_coarse_one_without_the_truth(sample, tmp_path, name, gain, shift):
     write(tmp_path, "hall.npy", (gain * quantity(sample, name)[0] + shift).numpy())
     blind = sample_of(plane() + 3 * (plane() > 6.5), scale=4)
     object.__setattr__(blind, "depth", None)
@@ -91,7 +82,7 @@ def test_relative_map_is_fitted_to_the_coarse_one_without_the_truth(
     torch.testing.assert_close(depth, sample.depth, rtol=1e-3, atol=0)
 
 
-def test_holes_stay_holes_and_a_scale_is_fitted_around_them(sample: DepthSample, tmp_path: Path) -> None:
+def test_holes_stay_holes_and_a_scale_is_fitted_around_them(sample, tmp_path):
     values = 40 * truth(sample)
     values[4:9, 3:20] = np.nan
     write(tmp_path, "hall.npy", values)
@@ -100,7 +91,7 @@ def test_holes_stay_holes_and_a_scale_is_fitted_around_them(sample: DepthSample,
     assert float((depth / full(sample) - 1).nan_to_num().abs().max()) < 0.02
 
 
-def test_zeros_of_a_fitted_depth_map_are_holes(sample: DepthSample, tmp_path: Path) -> None:
+def test_zeros_of_a_fitted_depth_map_are_holes(sample, tmp_path):
     values = (100 * truth(sample) + 20).round().astype(np.uint16)
     values[4:20, 3:30] = 0
     write(tmp_path, "hall.png", values)
@@ -111,7 +102,7 @@ def test_zeros_of_a_fitted_depth_map_are_holes(sample: DepthSample, tmp_path: Pa
     assert "whole numbers" in method.describe(sample)
 
 
-def test_line_passes_through_most_points() -> None:
+def test_line_passes_through_most_points():
     x = torch.linspace(0, 1, 101, dtype=torch.float64)
     y = 3 * x + 2
     y[::4] += 50 * x[::4]
@@ -119,9 +110,9 @@ def test_line_passes_through_most_points() -> None:
     assert fit_line(x, 5 * x, shift=False) == pytest.approx((5, 0))
 
 
-def test_map_of_another_size_is_resized_only_when_asked(sample: DepthSample, tmp_path: Path) -> None:
+def test_map_of_another_size_is_resized_only_when_asked(sample, tmp_path):
     write(tmp_path, "hall.npy", truth(sample)[::2, ::2])
-    with pytest.raises(ValueError, match=r"hall.npy: expected 32 x 48 pixels .* got 16 x 24; .*resize=nearest"):
+    with pytest.raises(ValueError, match=r"hall.npy: expected"):
         External(str(tmp_path))(sample)
     near = External(str(tmp_path), resize="nearest")(sample)
     assert torch.equal(near[:, ::2, ::2], torch.from_numpy(truth(sample)[None, ::2, ::2]))
@@ -129,7 +120,7 @@ def test_map_of_another_size_is_resized_only_when_asked(sample: DepthSample, tmp
     assert External(str(tmp_path), resize="bilinear")(sample).shape == (1, 32, 48)
 
 
-def test_names_follow_a_template_and_other_files_are_reported(sample: DepthSample, tmp_path: Path) -> None:
+def test_names_follow_a_template_and_other_files_are_reported(sample, tmp_path):
     (tmp_path / "set" / "x4").mkdir(parents=True)
     write(tmp_path, "set/x4/hall_pred.npy", truth(sample))
     write(tmp_path, "set/x4/cellar_pred.npy", truth(sample))
@@ -154,31 +145,23 @@ def test_names_follow_a_template_and_other_files_are_reported(sample: DepthSampl
         (lambda z: (1000 * z).astype(np.uint16), {}, r"hall.npy: expected method.unit=mm"),
     ],
 )
-def test_map_that_cannot_be_right_is_refused_by_name(
-    sample: DepthSample, tmp_path: Path, change: object, settings: dict[str, str], message: str
-) -> None:
-    write(tmp_path, "hall.npy", change(truth(sample)))  # type: ignore[operator]
+def test_map_that_cannot_be_right_is_refused_by_name(sample, tmp_path, change, settings, message):
+    write(tmp_path, "hall.npy", change(truth(sample)))
     with pytest.raises(ValueError, match=message):
-        External(str(tmp_path), **settings)(sample)  # type: ignore[arg-type]
+        External(str(tmp_path), **settings)(sample)
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"path": "nowhere"}, "path: expected a directory"),
-        ({"file": "{seen}"}, "file: expected a name with {scene}"),
-        ({"range_type": "depth"}, "range_type: expected one of orthogonal"),
-        ({"fit": "cubic"}, "fit: expected one of null, scale, affine"),
-        ({"resize": "cubic"}, "resize: expected one of null, nearest"),
-        ({"unit": "feet"}, "unit: expected m, cm, mm"),
-    ],
-)
-def test_settings_are_checked(tmp_path: Path, settings: dict[str, str], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        External(**{"path": str(tmp_path), **settings})  # type: ignore[arg-type]
+    ("key", "value"),
+    [("path", "nowhere"), ("file", "{seen}"), ("range_type", "depth"), ("fit", "cubic"), ("resize", "cubic"),
+     ("unit", "feet")],
+)  # fmt: skip
+def test_settings_are_checked(tmp_path, key, value):
+    with pytest.raises(ValueError, match=f"{key}: expected"):
+        External(**{"path": str(tmp_path), key: value})
 
 
-def test_two_files_of_a_scene_and_a_missing_one_are_refused(sample: DepthSample, tmp_path: Path) -> None:
+def test_two_files_of_a_scene_and_a_missing_one_are_refused(sample, tmp_path):
     with pytest.raises(ValueError, match=r"hall: expected a map as .*there is none"):
         External(str(tmp_path))(sample)
     for name in ("hall.npy", "hall.npz"):

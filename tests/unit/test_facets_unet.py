@@ -1,26 +1,125 @@
-"""Facets with context: planes at every factor, units, holes, hints, confidence, and what it starts from."""
+"""Facets, with and without context: what holds for any weights, hints, confidence, sharing, and that it can learn."""
 
 import itertools
-from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor, nn
+from small_scenes import maps, photos, plane_map
+from torch import nn
 from torch.nn import functional
 
 from dsr.degradation.downsampling import FACTS, KERNELS, Downsampling, encode_facts
 from dsr.methods.networks import facets_planes, facets_unet
 from dsr.methods.networks.facets import Facets, enlarge_and_join
-from dsr.methods.networks.facets_planes import NEIGHBOURS, average_planes, mix_planes
+from dsr.methods.networks.facets_planes import NEIGHBOURS, average_planes, mix_planes, stencil
 from dsr.methods.networks.facets_unet import FacetsUNet
-from dsr.methods.networks.network import Answer
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, save_network
+
+
+def _facets(scale=4, *, noise=0.1, facets=2):
+    """Return a small network with weights far from those that it starts with."""
+    torch.manual_seed(scale)
+    net = Facets(scale, width=12, blocks=1, facets=facets).requires_grad_(False)
+    for parameter in net.parameters():
+        parameter.add_(noise * torch.randn_like(parameter))
+    return net
+
+
+def test_untrained_mixture_is_the_spline_blend_of_central_difference_planes():
+    """A plain loop over high-resolution pixels, with every output of the network's three heads at 0."""
+    net, coarse = _facets(noise=0), maps(4, 5)
+    for head in (net.planes, net.choice):
+        torch.nn.init.zeros_(head.weight)
+        torch.nn.init.zeros_(head.bias)
+    result = net.upsample(photos(16, 20), coarse)[0, 0]
+    values = coarse[0, 0]
+    first = torch.tensor([0.0, 2.0, 0.0]).softmax(0).double()
+
+    def at(i, j):
+        """Return the map, continued linearly by one pixel."""
+        for axis, k, size in ((0, i, 4), (1, j, 5)):
+            if k in (-1, size):
+                inner, outer = (0, 1) if k == -1 else (size - 1, size - 2)
+                near, far = ((inner, j), (outer, j)) if axis == 0 else ((i, inner), (i, outer))
+                return 2 * at(*near) - at(*far)
+        return float(values[i, j])
+
+    def slope(before, here, after):
+        return float(first @ torch.tensor([here - before, (after - before) / 2, after - here]).double())
+
+    def spline(t, step):
+        return {-1: 0.5 * (0.5 - t) ** 2, 0: 0.75 - t * t, 1: 0.5 * (0.5 + t) ** 2}[step]
+
+    for y, x in ((0, 0), (5, 9), (9, 6), (15, 19), (7, 0)):
+        i, j = y // 4, x // 4
+        ty, tx = (y % 4 + 0.5) / 4 - 0.5, (x % 4 + 0.5) / 4 - 0.5
+        total = weights = 0.0
+        for dy in (-1, 0, 1):
+            for dx in (-1, 0, 1):
+                weight = spline(ty, dy) * spline(tx, dx) + 1e-4
+                inside = (i + dy in range(4), j + dx in range(5))
+                k, m = i + dy * inside[0], j + dx * inside[1]  # a neighbour outside is the pixel itself
+                along_u = slope(at(k, m - 1), at(k, m), at(k, m + 1))
+                along_v = slope(at(k - 1, m), at(k, m), at(k + 1, m))
+                total += weight * (at(k, m) + (tx + j - m) * along_u + (ty + i - k) * along_v)
+                weights += weight
+        assert float(result[y, x]) == pytest.approx(total / weights, rel=1e-6)
+
+
+def test_facets_without_slopes_stay_within_the_surrounding_values():
+    net = Facets(4, width=12, blocks=1, slopes=False)
+    coarse = torch.zeros(1, 1, 6, 6, dtype=torch.float64)
+    coarse[..., 3:] = 1.0
+    with torch.no_grad():
+        for parameter in (net.planes.weight, net.planes.bias):
+            parameter.zero_()
+        hr = net.upsample(photos(24, 24), coarse)
+    assert 0 <= float(hr.min()) < 1e-12
+    assert 1 - 1e-12 < float(hr.max()) <= 1 + 1e-12
+
+
+def test_bend_is_zero_on_planes_and_the_step_beside_an_edge():
+    assert float(stencil(plane_map(8, 9)).bend.max()) < 1e-12
+    step = torch.zeros(1, 1, 9, 12)
+    step[..., 6:] = 2.0
+    bend = stencil(step).bend[0, 0, 4]
+    assert bend.tolist() == [0, 0, 0, 0, 2, 2, 2, 2, 0, 0, 0, 0]
+
+
+def test_gradients_of_facets_agree_with_finite_differences():
+    net = _facets(2, facets=1).double().requires_grad_()
+    rgb, coarse = photos(8, 6).double(), maps(4, 3)
+
+    def loss(value):
+        return torch.func.functional_call(net, {"choice.bias": value}, (rgb, coarse / 30)).square().mean()
+
+    assert torch.autograd.gradcheck(loss, net.choice.bias.detach().clone().requires_grad_())
+
+
+@pytest.mark.slow
+def test_training_learns_an_edge_that_the_photo_shows():
+    """A wall behind a wall: after a few steps on one patch the edge is several times sharper than a spline's."""
+    torch.manual_seed(0)
+    hr = torch.full((1, 1, 32, 32), 20.0)
+    hr[..., 13:] = 26.0
+    rgb = (hr / 40).expand(1, 3, 32, 32)
+    coarse, net = functional.avg_pool2d(hr, 4), Facets(4, width=16, blocks=1)
+    optimiser = torch.optim.Adam(net.parameters(), 3e-3)
+    errors = []
+    for _ in range(80):
+        loss = (net.upsample(rgb, coarse) - hr).abs().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        errors.append(float(loss.detach()))
+    assert errors[-1] < 0.2 * errors[0]
+
 
 SCALES = (1, 2, 4, 8, 16)
 
 
-def _net(scale: int = 4, width: int = 8, deep: int = 12) -> FacetsUNet:
+def _net(scale=4, width=8, deep=12):
     """Return a small network with random weights, also in the layers that begin small."""
     torch.manual_seed(3)
     net = FacetsUNet(scale, width, deep, 4).eval()
@@ -30,11 +129,11 @@ def _net(scale: int = 4, width: int = 8, deep: int = 12) -> FacetsUNet:
     return net
 
 
-def _maps(answer: Answer) -> tuple[Tensor, Tensor, Tensor]:
+def _maps(answer):
     return answer.disparity, answer.spread, answer.angle
 
 
-def _inputs(scale: int, height: int = 12, width: int = 10) -> tuple[Tensor, Tensor]:
+def _inputs(scale, height=12, width=10):
     """Return a photo and a rough map whose median is 1 or so."""
     generator = torch.Generator().manual_seed(scale)
     if scale == 1:
@@ -43,14 +142,14 @@ def _inputs(scale: int, height: int = 12, width: int = 10) -> tuple[Tensor, Tens
     return rgb, 1 + 0.1 * torch.rand((1, 1, height, width), generator=generator).double()
 
 
-def _plane(height: int, width: int, scale: int) -> Tensor:
+def _plane(height, width, scale):
     """Return a plane at the centres of the pixels of a map of a factor, (1, 1, height, width)."""
     v, u = ((scale * (torch.arange(n, dtype=torch.float64) + 0.5)) for n in (height, width))
     return (2 + 0.003 * u - 0.002 * v[:, None])[None, None]
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_planes_are_reproduced_by_any_weights(scale: int) -> None:
+def test_planes_are_reproduced_by_any_weights(scale):
     rgb, values = _inputs(scale)
     height, width = values.shape[-2:]
     found = _net(scale).upsample(rgb, _plane(height, width, scale))
@@ -58,7 +157,7 @@ def test_planes_are_reproduced_by_any_weights(scale: int) -> None:
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_result_scales_with_the_map(scale: int) -> None:
+def test_result_scales_with_the_map(scale):
     rgb, values = _inputs(scale)
     net = _net(scale)
     once, thrice = (net.answer(rgb, factor * values) for factor in (1, 3))
@@ -68,7 +167,7 @@ def test_result_scales_with_the_map(scale: int) -> None:
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_bands_change_nothing(scale: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bands_change_nothing(scale, monkeypatch):
     rgb, values = _inputs(scale, 40, 6)
     net, steps = _net(scale), []
     whole = net.answer(rgb, values)
@@ -79,16 +178,7 @@ def test_bands_change_nothing(scale: int, monkeypatch: pytest.MonkeyPatch) -> No
     assert steps == [(number, 5) for number in range(1, 6)]
 
 
-@pytest.mark.parametrize("scale", [1, 4])
-def test_holes_are_filled(scale: int) -> None:
-    rgb, values = _inputs(scale)
-    values[..., 3:7, 2:6] = torch.nan
-    for each in _maps(_net(scale).answer(rgb, values)):
-        assert each.shape == (1, 1, *rgb.shape[-2:])
-        assert bool((each > 0).all())
-
-
-def test_hints_and_noise_change_the_result() -> None:
+def test_hints_and_noise_change_the_result():
     rgb, values = _inputs(4)
     net = _net()
     nothing = net.answer(rgb, values).disparity
@@ -103,18 +193,18 @@ def test_hints_and_noise_change_the_result() -> None:
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8, 16])
-def test_every_parameter_serves(scale: int) -> None:
+def test_every_parameter_serves(scale):
     net = _net(scale).train()
     for factor in (1, 2) if scale == 2 else (scale,):
         rgb, values = _inputs(factor)
         answer = net.answer(rgb, values.float(), None, torch.ones(1, FACTS))
-        sum(each.square().mean() for each in _maps(answer)).backward()  # type: ignore[union-attr]
+        sum(each.square().mean() for each in _maps(answer)).backward()
     for name, parameter in net.named_parameters():
         assert parameter.grad is not None, name
         assert bool(parameter.grad.any()), name
 
 
-def test_weights_of_factor_2_serve_maps_of_the_photos_size(tmp_path: Path) -> None:
+def test_weights_of_factor_2_serve_maps_of_the_photos_size(tmp_path):
     net = _net(2)
     save_network(tmp_path / "weights", net, "facets")
     for scale in (1, 2):
@@ -127,7 +217,7 @@ def test_weights_of_factor_2_serve_maps_of_the_photos_size(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8, 16])
-def test_it_starts_near_facets(scale: int) -> None:
+def test_it_starts_near_facets(scale):
     torch.manual_seed(1)
     first = Facets(4 if scale < 8 else 8, width=8, blocks=4).eval()
     net = FacetsUNet(scale, 8, 12, 4)
@@ -145,7 +235,7 @@ def test_it_starts_near_facets(scale: int) -> None:
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8, 16])
-def test_it_starts_from_another_factor_near_what_that_one_does(scale: int) -> None:
+def test_it_starts_from_another_factor_near_what_that_one_does(scale):
     torch.manual_seed(1)
     first = FacetsUNet(4, 8, 12, 4)
     first.start_from(Facets(4, width=8, blocks=4))
@@ -164,7 +254,7 @@ def test_it_starts_from_another_factor_near_what_that_one_does(scale: int) -> No
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_an_open_gate_reproduces_what_was_measured(kernel: str) -> None:
+def test_an_open_gate_reproduces_what_was_measured(kernel):
     rgb, values = _inputs(4)
     net, hints = _net(), torch.zeros(1, FACTS)
     hints[0, KERNELS.index(kernel)] = 1
@@ -183,7 +273,7 @@ def test_an_open_gate_reproduces_what_was_measured(kernel: str) -> None:
 
 
 @pytest.mark.parametrize("reach", [1, 2, 16])
-def test_planes_are_averaged_with_those_around_extended_to_the_pixel(reach: int) -> None:
+def test_planes_are_averaged_with_those_around_extended_to_the_pixel(reach):
     generator = torch.Generator().manual_seed(reach)
     planes = torch.randn((1, 1, 3, 5, 7), generator=generator, dtype=torch.float64)
     weights = torch.rand((1, 1, NEIGHBOURS, 5, 7), generator=generator, dtype=torch.float64)
@@ -199,14 +289,14 @@ def test_planes_are_averaged_with_those_around_extended_to_the_pixel(reach: int)
 
 
 @pytest.mark.parametrize("reach", [1, 4])
-def test_gradients_of_averaged_planes_are_those_of_differences(reach: int) -> None:
+def test_gradients_of_averaged_planes_are_those_of_differences(reach):
     generator = torch.Generator().manual_seed(reach)
     planes = torch.randn((1, 1, 3, 3, 4), generator=generator, dtype=torch.float64, requires_grad=True)
     weights = torch.rand((1, 1, NEIGHBOURS, 3, 4), generator=generator, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda *given: average_planes(*given, reach), (planes, weights), fast_mode=True)
 
 
-def test_gradients_of_mixed_planes_are_those_of_differences(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gradients_of_mixed_planes_are_those_of_differences(monkeypatch):
     monkeypatch.setattr(facets_planes, "_CHUNK", 5 * 9 * 4)  # several parts, the last one smaller
     generator = torch.Generator().manual_seed(0)
     planes = torch.randn((1, 1, 3, 3, 4), generator=generator, dtype=torch.float64, requires_grad=True)
@@ -215,10 +305,10 @@ def test_gradients_of_mixed_planes_are_those_of_differences(monkeypatch: pytest.
     torch.testing.assert_close(mix_planes(planes, found, 2)[1], found[:, NEIGHBOURS:])
 
 
-def test_two_convolutions_and_the_shuffle_between_them_are_one() -> None:
+def test_two_convolutions_and_the_shuffle_between_them_are_one():
     generator = torch.Generator().manual_seed(1)
     up, join = nn.Conv2d(3, 12, 1), nn.Conv2d(3 + 2, 4, 3, padding=1)
-    up, join = (each.double().to(memory_format=torch.channels_last) for each in (up, join))  # type: ignore[call-overload]
+    up, join = (each.double().to(memory_format=torch.channels_last) for each in (up, join))
     x, features = (
         torch.randn(shape, generator=generator, dtype=torch.float64, requires_grad=True)
         for shape in ((2, 3, 4, 5), (2, 2, 8, 10))
@@ -232,12 +322,11 @@ def test_two_convolutions_and_the_shuffle_between_them_are_one() -> None:
     (found * factors).sum().backward()
     for each, gradient in zip(inputs, expected_gradients, strict=True):
         torch.testing.assert_close(each.grad, gradient)
-        assert each.grad is not None
         assert each.grad.stride() == each.stride()  # which several devices expect
 
 
 @pytest.mark.parametrize("width", [1, 4])
-def test_mixing_in_single_precision_keeps_planes_and_logits(width: int) -> None:
+def test_mixing_in_single_precision_keeps_planes_and_logits(width):
     generator = torch.Generator().manual_seed(2)
     planes = torch.zeros((1, 2, 3, 3, width), dtype=torch.float64)  # all of them are of one
     planes[:, :, 2] = 0.5
@@ -250,7 +339,7 @@ def test_mixing_in_single_precision_keeps_planes_and_logits(width: int) -> None:
     assert torch.equal(found, before)
 
 
-def test_mixed_planes_are_planes_at_each_pixel_weighted_by_a_softmax() -> None:
+def test_mixed_planes_are_planes_at_each_pixel_weighted_by_a_softmax():
     generator = torch.Generator().manual_seed(1)
     planes = torch.randn((1, 2, 3, 3, 4), generator=generator, dtype=torch.float64)
     choice = torch.randn((1, 2 * NEIGHBOURS, 6, 8), generator=generator, dtype=torch.float64)
@@ -272,16 +361,7 @@ def test_mixed_planes_are_planes_at_each_pixel_weighted_by_a_softmax() -> None:
         assert float(found[0, 0, row, column]) == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("sizes", "message"),
-    [((3,), "scale: expected 1, 2, 4, 8 or 16, got 3"), ((4, 0), "got width 0"), ((4, 8, 8, 2), "got .* blocks 2")],
-)
-def test_sizes_are_checked(sizes: tuple[int, ...], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        FacetsUNet(*sizes)
-
-
-def test_prepared_patches_have_the_answer_of_the_maps_and_the_hints() -> None:
+def test_prepared_patches_have_the_answer_of_the_maps_and_the_hints():
     net, generator = _net(), torch.Generator().manual_seed(5)
     rgb, values = torch.rand((2, 3, 48, 40), generator=generator), 1 + torch.rand((2, 1, 12, 10), generator=generator)
     values[1, :, 3:6, 2:5] = torch.nan
@@ -295,7 +375,7 @@ def test_prepared_patches_have_the_answer_of_the_maps_and_the_hints() -> None:
         assert torch.equal(one, other)
 
 
-def test_images_of_a_batch_do_not_see_each_other() -> None:
+def test_images_of_a_batch_do_not_see_each_other():
     """With kernels of their own, one of them unknown, and holes in one."""
     net = _net()
     rgb = torch.rand((3, 3, 48, 40), generator=torch.Generator().manual_seed(5))
@@ -311,24 +391,20 @@ def test_images_of_a_batch_do_not_see_each_other() -> None:
                 torch.testing.assert_close(one, all_of_them[i : i + 1], rtol=1e-4, atol=1e-6)
 
 
-def test_photos_of_another_size_and_other_networks_are_refused() -> None:
+def test_photos_of_another_size_and_other_networks_are_refused():
     rgb, values = _inputs(4)
     with pytest.raises(ValueError, match="rgb: expected"):
         _net(8).answer(rgb, values)
     for first in (FacetsUNet(4, 12, 12, 4), Facets(4, width=8, blocks=5)):
-        with pytest.raises(ValueError, match=r"expected weights of Facets or FacetsUNet with {'width': 8, 'blocks': 4"):
+        with pytest.raises(ValueError, match=r"expected weights of Facets or FacetsUNet with .*'width': 8"):
             _net().start_from(first)
-
-
-def test_a_unet_of_another_width_starts_from_nothing() -> None:
-    """Neither a part of its weights nor a bias of them is taken over."""
-    first, net = _net(8), FacetsUNet(16, 8, 10, 4)
+    net = FacetsUNet(16, 8, 10, 4)  # of another width in its depth: neither a part of those weights nor a bias is taken
     fresh = {name: value.clone() for name, value in net.state_dict().items() if name.startswith("wide.")}
-    net.start_from(first)
+    net.start_from(_net(8))
     assert all(torch.equal(net.state_dict()[name], value) for name, value in fresh.items())
 
 
-def test_layers_at_the_low_resolution_are_shared_and_not_trained(tmp_path: Path) -> None:
+def test_layers_at_the_low_resolution_are_shared_and_not_trained(tmp_path):
     first, net = _net(4), _net(8)
     with torch.no_grad():
         for parameter in first.parameters():
@@ -349,5 +425,5 @@ def test_layers_at_the_low_resolution_are_shared_and_not_trained(tmp_path: Path)
     for name, value in whole.items():
         assert torch.equal(parts[name], value), name
     (tmp_path / "x4").unlink()
-    with pytest.raises(FileNotFoundError, match="x8: expected x4 beside it, whose layers it shares; there is none"):
+    with pytest.raises(FileNotFoundError, match="x8: expected"):
         load_network(tmp_path / "x8", NETWORKS)

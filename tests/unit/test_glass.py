@@ -1,40 +1,44 @@
-"""Clear, mirroring and glossy objects: nothing changes beside them, the truth is theirs, and sensors see it wrongly."""
+"""Clear, mirroring and glossy objects: how they are made, what sensors see of them, and what finds them."""
 
+import importlib.util
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
+import safetensors.torch
 import torch
-from torch import Tensor
+from small_scenes import seeded
 
+from dsr.data.rendered import Procedural
 from dsr.degradation.glass import KINDS, Pose, add_glass, ball
+from dsr.degradation.noise import NOISES
 from dsr.degradation.random_degradation import SENSOR_NOISES, Everything
 from dsr.geometry.camera import Camera
-from dsr.sample import AllHolesError, DepthSample, Scene
+from dsr.inference import upsample_surface
+from dsr.methods.glass import FEATURES, GlassFinder, expect_glass, glass_features, probability_of_glass
+from dsr.metrics.calibration import off_auc
+from dsr.sample import AllHolesError, Scene
 
 SIZE = 96
 
 
-def _generator(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
-def _scene(slope: float = 0.5, size: int = SIZE) -> Scene:
+def _scene(slope=0.5, size=SIZE):
     """Return a floor of 2 m and nearer below, or a wall at 2 m."""
     depth = (2 - slope * torch.linspace(-0.5, 1, size, dtype=torch.float64))[:, None].repeat(1, 1, size)
-    rgb = torch.rand((3, size, size), generator=_generator(1))
+    rgb = torch.rand((3, size, size), generator=seeded(1))
     return Scene("test", "room", rgb, Camera.from_fov(60, size, size), depth)
 
 
-def _changed(scene: Scene, other: Scene) -> Tensor:
+def _changed(scene, other):
     """Return the mask of the pixels with another true depth, (H, W)."""
     return (scene.depth != other.depth)[0]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_nothing_changes_beside_an_object_and_the_truth_is_nearer_inside(kind: str) -> None:
+def test_nothing_changes_beside_an_object_and_the_truth_is_nearer_inside(kind):
     scene, found = _scene(), 0
     for seed in range(25):
-        other, seen = add_glass(scene, _generator(seed), {kind: 1})
+        other, seen = add_glass(scene, seeded(seed), {kind: 1})
         inside = _changed(scene, other)
         found += bool(inside.any())
         assert torch.equal(other.rgb[:, ~inside], scene.rgb[:, ~inside])
@@ -48,29 +52,28 @@ def test_nothing_changes_beside_an_object_and_the_truth_is_nearer_inside(kind: s
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_object_is_a_function_of_the_generator(kind: str) -> None:
-    (one, seen), (other, again) = (add_glass(_scene(), _generator(7), {kind: 1}) for _ in range(2))
+def test_an_object_is_a_function_of_the_generator(kind):
+    (one, seen), (other, again) = (add_glass(_scene(), seeded(7), {kind: 1}) for _ in range(2))
     assert torch.equal(one.rgb, other.rgb)
     assert torch.equal(one.depth, other.depth)
     torch.testing.assert_close(seen, again, rtol=0, atol=0, equal_nan=True)
-    assert not torch.equal(one.rgb, add_glass(_scene(), _generator(8), {kind: 1})[0].rgb)
+    assert not torch.equal(one.rgb, add_glass(_scene(), seeded(8), {kind: 1})[0].rgb)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_holes_of_the_truth_are_no_depth_to_a_sensor(kind: str) -> None:
+def test_holes_of_the_truth_are_no_depth_to_a_sensor(kind):
     scene = _scene()
-    assert scene.depth is not None
-    holes = torch.rand((1, SIZE, SIZE), generator=_generator()) < 0.7
+    holes = torch.rand((1, SIZE, SIZE), generator=seeded()) < 0.7
     holes[..., : SIZE // 2] = True
     scene = replace(scene, depth=scene.depth.masked_fill(holes, torch.nan))
     for seed in range(10):
-        other, seen = add_glass(scene, _generator(seed), {kind: 1})
+        other, seen = add_glass(scene, seeded(seed), {kind: 1})
         assert bool((other.depth.isfinite() | scene.depth.isnan()).all())
         assert bool((seen.isnan() | (seen > 0)).all())
         assert bool(((seen >= other.depth * 0.5) | seen.isnan()).all())
 
 
-def test_a_ball_is_round() -> None:
+def test_a_ball_is_round():
     pose = Pose(48, 80, (0, -1), 0.4, -0.4, 2)
     body = ball(pose, 30, (SIZE, SIZE))
     v, u = torch.meshgrid(
@@ -90,10 +93,10 @@ def test_a_ball_is_round() -> None:
     torch.testing.assert_close(body.front[:, inner], normals[:, inner], rtol=0, atol=0.05)
 
 
-def test_a_mirror_shows_the_virtual_image_or_nothing() -> None:
+def test_a_mirror_shows_the_virtual_image_or_nothing():
     scene, shown, lost = _scene(slope=0), 0, 0
     for seed in range(30):
-        other, seen = add_glass(scene, _generator(seed), {"mirror": 1})
+        other, seen = add_glass(scene, seeded(seed), {"mirror": 1})
         behind = (seen - other.depth)[0][_changed(scene, other)]
         known = behind[behind.isfinite()]
         assert bool(((known.abs() < 1e-6) | ((known - 2).abs() < 1e-6)).all())  # a wall 2 m before the mirror
@@ -103,17 +106,17 @@ def test_a_mirror_shows_the_virtual_image_or_nothing() -> None:
     assert lost > 1000
 
 
-def test_clear_objects_are_seen_through_missed_or_seen_and_opaque_ones_are_right() -> None:
+def test_clear_objects_are_seen_through_missed_or_seen_and_opaque_ones_are_right():
     scene, through, missed, right, opaque = _scene(slope=0), 0.0, 0.0, 0.0, 0.0
     for seed in range(40):
-        other, seen = add_glass(scene, _generator(seed), {"vessel": 1})
+        other, seen = add_glass(scene, seeded(seed), {"vessel": 1})
         inside = _changed(scene, other)
         if int(inside.sum()) > 50:
             error = (seen / other.depth - 1)[0][inside]
             through += float((error > 0.03).double().mean()) / 40
             missed += float(error.isnan().double().mean()) / 40
             right += float((error.abs() < 0.01).double().mean()) / 40
-        other, seen = add_glass(scene, _generator(seed), {"gloss": 1})
+        other, seen = add_glass(scene, seeded(seed), {"gloss": 1})
         inside = _changed(scene, other)
         opaque += float(torch.equal(seen[:, ~inside], scene.depth[:, ~inside]))
         error = (seen / other.depth - 1)[0][inside]
@@ -121,14 +124,14 @@ def test_clear_objects_are_seen_through_missed_or_seen_and_opaque_ones_are_right
     assert min(through, missed, right) > 0.08
 
 
-def _sample(everything: Everything, seed: int, *, soft: bool = False) -> tuple[DepthSample, Tensor, Tensor]:
-    generator = _generator(seed)
+def _sample(everything, seed, *, soft=False):
+    generator = seeded(seed)
     sample, hints = everything(_scene(), 2, generator, soft=soft)
     return sample, hints.noise, generator.get_state()
 
 
 @pytest.mark.parametrize("kind", ["none", "white", "correlated", *SENSOR_NOISES])
-def test_maps_that_show_no_glass_are_what_they_were(kind: str) -> None:
+def test_maps_that_show_no_glass_are_what_they_were(kind):
     without = Everything(noises={kind: 1}, told=0)
     for seed in range(3):
         for soft in {True, kind in SENSOR_NOISES}:  # truths with soft steps have no glass in any map
@@ -139,7 +142,7 @@ def test_maps_that_show_no_glass_are_what_they_were(kind: str) -> None:
                 torch.testing.assert_close(first, second, rtol=0, atol=0, equal_nan=True)
 
 
-def test_maps_show_what_sensors_see_and_hints_on_noise_leave_it_out() -> None:
+def test_maps_show_what_sensors_see_and_hints_on_noise_leave_it_out():
     everything = Everything(
         noises={"waves": 1}, holes={"none": 1}, kernels={"nearest": 1}, folds=0, relief=0, displaced=0, rounded=0,
         photo=0, textured=0, clear=1, told=1,
@@ -155,3 +158,129 @@ def test_maps_show_what_sensors_see_and_hints_on_noise_leave_it_out() -> None:
         beyond += int(far.sum())
         assert float(noise.max()) < 0.05
     assert beyond > 200
+
+
+SCRIPT = Path(__file__).parents[2] / "scripts" / "train_glass.py"
+
+
+def _random(height, width, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    rgb = torch.rand(3, height, width, generator=generator)
+    inverse = 0.5 + 0.01 * torch.randn(1, height // 2, width // 2, generator=generator)
+    inverse[0, 10:14, 12:20] = torch.nan
+    return rgb, inverse
+
+
+def test_features_do_not_depend_on_the_unit_of_depth():
+    rgb, inverse = _random(120, 160)
+    found = glass_features(rgb, inverse)
+    assert found.shape == (FEATURES, 240, 320)
+    assert bool(found.isfinite().all())
+    torch.testing.assert_close(glass_features(rgb, 1e3 * inverse), found, rtol=1e-3, atol=2e-3)
+
+
+def _contradiction(*, textured, holes):
+    """Return a photo and a wall; amid them a patch with texture and a highlight, and a patch that is lost in part."""
+    rgb, inverse = torch.full((3, 240, 320), 0.5), torch.full((1, 240, 320), 0.5)
+    if textured:
+        noise = torch.rand(1, 40, 40, generator=torch.Generator().manual_seed(0))
+        rgb[:, 100:140, 140:180] += 0.3 * (noise - 0.5)
+        rgb[:, 104:108, 150:170] = 0.95
+    if holes:
+        inverse[0, 104:136, 150:156] = torch.nan
+        inverse[0, 120:128, 150:174] = torch.nan
+    return rgb, inverse
+
+
+def test_texture_and_holes_together_are_glass():
+    both, texture, holes = (
+        float(probability_of_glass(*_contradiction(textured=textured, holes=holes)).max())
+        for textured, holes in ((True, True), (True, False), (False, True))
+    )
+    assert both > 0.15
+    assert texture == 0
+    assert both > 2 * holes
+
+
+@pytest.mark.parametrize("share", [0.9, 0.5, 0.2])
+def test_single_missing_or_measured_pixels_are_no_glass(share):
+    rgb, inverse = _contradiction(textured=True, holes=False)
+    lost = torch.rand(inverse.shape, generator=torch.Generator().manual_seed(1)) > share
+    assert float((expect_glass(rgb, inverse.masked_fill(lost, torch.nan)) > 0.02).float().mean()) < 0.01
+
+
+def test_what_is_cut_away_is_no_glass():
+    rgb, inverse = _contradiction(textured=True, holes=False)
+    inverse[..., :130] = torch.nan
+    assert float(probability_of_glass(rgb, inverse).max()) == 0
+    narrow = inverse.clone()
+    narrow[..., :105] = 0.5
+    assert float(probability_of_glass(rgb, narrow).max()) > 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_probabilities_have_single_precision_and_no_gradient(dtype):
+    rgb, inverse = _contradiction(textured=True, holes=True)
+    with torch.inference_mode():
+        probability_of_glass(rgb, inverse)
+    found = probability_of_glass(rgb.to(dtype).requires_grad_(), inverse)
+    assert found.dtype == torch.float32
+    assert not found.requires_grad
+    assert float(found.max()) > 0.1
+    assert float(probability_of_glass(rgb.to(dtype), torch.full_like(inverse, torch.nan)).max()) == 0
+    assert probability_of_glass(rgb[:, :3, :4], inverse[:, :1, :2]).shape == (1, 3, 4)
+
+
+def test_wrong_depth_of_simulated_vessels_is_ranked_first_and_expected_to_be_wrong():
+    source, aucs = Procedural(6, size=256, seed=5), []
+    for number, name in enumerate(source.scenes()):
+        scene, generator = source.load(name), torch.Generator().manual_seed(number)
+        full, seen = add_glass(scene, generator, {"vessel": 1})
+        rgb = full.rgb.float()
+        inverse = NOISES["structured"](seen.float().reciprocal(), rgb.mean(dim=0, keepdim=True), generator)
+        wrong = (full.depth != scene.depth) & ((inverse * full.depth - 1).abs() > 0.02)
+        known = inverse.isfinite()
+        if int((wrong & known).sum()) < 100:
+            continue
+        found = probability_of_glass(rgb, inverse)
+        assert found.shape == wrong.shape
+        aucs.append(float(off_auc(found[known].double(), wrong[known].double(), 0.5)))
+    assert len(aucs) >= 3
+    assert sum(aucs) / len(aucs) > 0.8
+
+
+def test_stated_errors_of_all_methods_know_glass_unless_the_map_is_told_to_be_clean(
+    monkeypatch,
+):
+    rgb, depth, camera = (
+        torch.full((3, 48, 64), 0.5),
+        torch.full((1, 48, 64), 2.0),
+        Camera.from_fov(60, width=64, height=48),
+    )
+    glass = torch.zeros(1, 48, 64)
+    glass[:, :24] = 0.06
+    monkeypatch.setattr("dsr.inference.any_ratio.expect_glass", lambda *_: glass)
+    for method in ("facets", "bilateral"):
+        surface = upsample_surface(rgb, depth, camera, method=method, device="cpu")
+        torch.testing.assert_close(surface.depth_error[:, :24], 0.06 * surface.depth[:, :24])
+        assert float(surface.depth_error[:, 26:].max()) < 0.06
+        assert surface.glass == 0.5
+    clean = upsample_surface(rgb, depth, camera, settings={"noise": 0.0}, device="cpu")
+    assert float(clean.depth_error.max()) < 0.06
+    assert clean.glass is None
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # Lightning's
+def test_training_script_writes_weights_that_fit(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    spec = importlib.util.spec_from_file_location("train_glass", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    small = ["--scenes", "2", "--rendered", "1", "--steps", "2", "--workers", "0", "-o", "glass.safetensors"]
+    monkeypatch.setattr("sys.argv", ["train_glass.py", *small])
+    module.main()
+    state = safetensors.torch.load_file("glass.safetensors")
+    GlassFinder().load_state_dict(state)
+    assert all(bool(each.isfinite().all()) for each in state.values())
+    assert float(state["scale"].min()) > 0

@@ -1,100 +1,132 @@
-"""Photo-guided filters: planes, offsets, holes and sizes for all, and each against its definition."""
+"""Filters of depth maps, with and without a photo: each against its definition, and their symmetries."""
 
+import json
 import math
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from small_scenes import disparity_of, plane, sample_of
 
-from dsr.degradation.downsampling import Downsampling, Kernel, make_sample
-from dsr.geometry.camera import Camera, from_range, to_range
-from dsr.methods.classical.bilateral import Bilateral, JointBilateral
+from dsr.geometry.camera import Camera, to_range
+from dsr.methods.classical.bilateral import Bilateral, JointBilateral, filter_bilateral
 from dsr.methods.classical.fast_global_smoother import FastGlobalSmoother, smooth, solve_lines
 from dsr.methods.classical.guided_filter import GuidedFilter, GuidedMethod, estimate_slopes, guided_filter
 from dsr.methods.classical.interpolation import Interpolation
-from dsr.sample import DepthSample, Scene
-from dsr.utils.ratios import SCALES
+from dsr.sample import DepthSample
+
+CAMERA = Camera(16, 12, 20.0, 20.0, 7.5, 5.5)
+
+
+def _stepped(height, width):
+    """Return noisy depth with a step, (height, width), so near that a hole that counted as 0 would weigh."""
+    values = np.random.default_rng(0).normal(0.05, 0.005, (height, width))
+    values[:, width // 2 :] += 0.5
+    return values.astype(np.float32)
+
+
+def _measured(depth_lr, scale=1):
+    camera_lr = CAMERA.rescale(depth_lr.shape[1], depth_lr.shape[0])
+    photo = torch.rand(3, CAMERA.height, CAMERA.width)
+    return DepthSample("set", "hall", photo, torch.from_numpy(depth_lr)[None], CAMERA, camera_lr, scale)
+
+
+def _mean_around(values, row, column, radius, sigmas):
+    """Return the bilateral mean at a pixel that is no hole and ``radius`` from the border."""
+    total = weights = 0.0
+    for i in range(-radius, radius + 1):
+        for j in range(-radius, radius + 1):
+            other = values[row + i, column + j]
+            if np.isfinite(other) and math.hypot(i, j) <= radius:
+                difference = (other - values[row, column]) / sigmas[0]
+                weight = math.exp(-(difference**2) / 2 - (i * i + j * j) / (2 * sigmas[1] ** 2))
+                total, weights = total + weight * other, weights + weight
+    return total / weights
+
+
+def test_filter_averages_pixels_of_similar_depth_and_leaves_out_holes():
+    values = _stepped(12, 16)
+    values[4:7, 5:7] = np.nan
+    result = filter_bilateral(torch.from_numpy(values)[None], 7, 0.02, 1.5)[0].numpy()
+    np.testing.assert_array_equal(np.isnan(result), np.isnan(values))
+    for row, column in ((3, 3), (5, 4), (5, 8), (7, 7), (8, 12)):
+        assert result[row, column] == pytest.approx(_mean_around(values, row, column, 3, (0.02, 1.5)), rel=1e-5)
+
+
+def test_map_of_the_photo_s_size_is_filtered_and_keeps_its_holes():
+    values = _stepped(12, 16)
+    values[2, 3] = np.nan
+    depth = Bilateral(7, 0.02, 1.5)(_measured(values))
+    assert torch.equal(depth.nan_to_num(), filter_bilateral(torch.from_numpy(values)[None], 7, 0.02, 1.5).nan_to_num())
+    filled = Bilateral(7, 0.02, 1.5, fill_holes=True)(_measured(values))
+    assert bool(filled.isfinite().all())
+    assert torch.equal(filled[depth.isfinite()], depth[depth.isfinite()])
+
+
+@pytest.mark.parametrize("size", [(12, 16), (5, 6), (3, 4)])
+def test_plane_is_reproduced_at_every_ratio(size):
+    camera_lr = CAMERA.rescale(size[1], size[0])
+    direction = torch.tensor([0.1, -0.05, 1.0], dtype=torch.float64)[:, None, None]
+    plane_lr, plane = (2 / (each.rays() * direction).sum(dim=0, keepdim=True) for each in (camera_lr, CAMERA))
+    photo, scale = torch.rand(3, 12, 16), 16 / size[1]
+    sample = DepthSample("set", "hall", photo, plane_lr, CAMERA, camera_lr, scale)
+    depth = Bilateral(sigma_depth=1e-6)(sample)  # so narrow that the filter changes nothing
+    torch.testing.assert_close(depth, plane, rtol=1e-5, atol=0)
+
+
+@pytest.mark.shared
+def test_frame_of_a_structured_light_camera_is_filtered_as_opencv_does(shared):
+    camera = Camera(**json.loads((shared / "expected" / "real_sensor.json").read_text())["camera"])
+    raw = cv2.imread(str(shared / "real/ddrnet/depth_map/frame_000001.png"), -1).astype(np.float32) / 1000
+    expected = cv2.bilateralFilter(raw, d=19, sigmaColor=0.03, sigmaSpace=3)
+    depth_lr = torch.from_numpy(np.where(raw > 0, raw, np.nan))[None]
+    photo = torch.zeros(3, camera.height, camera.width)
+    depth = Bilateral()(DepthSample("ddrnet", "frame_000001", photo, depth_lr, camera, camera, 1))[0].numpy()
+    np.testing.assert_array_equal(depth, np.where(raw > 0, expected, np.nan))
+
 
 METHODS = (GuidedFilter, JointBilateral, FastGlobalSmoother)
 every_method = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.__name__)
 Build = Callable[..., GuidedMethod]
 
 
-def _noise(*shape: int, seed: int = 0) -> Tensor:
+def _noise(*shape, seed=0):
     return torch.from_numpy(np.random.default_rng(seed).uniform(size=shape))
 
 
-def _sample(disparity: Tensor, kernel: Kernel = "box", scale: int = 4, rgb: Tensor | None = None) -> DepthSample:
-    """Return the problem of a scene with these disparities, (H, W)."""
-    height, width = disparity.shape
-    camera = Camera(width, height, 60.0, 55.0, 21.3, 17.9)
-    depth = from_range(disparity[None], camera, "disparity")
-    scene = Scene("set", "hall", _noise(3, height, width, seed=1) if rgb is None else rgb, camera, depth)
-    return make_sample(scene, scale, Downsampling(kernel), "disparity")
+def _sample(disparity, kernel="box", rgb=None):
+    """Return the problem of a scene with these disparities, (H, W), at scale 4."""
+    return sample_of(disparity, _noise(3, *disparity.shape, seed=1) if rgb is None else rgb, kernel=kernel)
 
 
-def _result(method: GuidedMethod, sample: DepthSample) -> Tensor:
+def _result(method, sample):
     """Return the high-resolution disparity, (H, W)."""
-    fine = method(sample)
-    assert fine.shape == (1, sample.camera.height, sample.camera.width)
-    return to_range(fine, sample.camera, "disparity")[0]
+    return disparity_of(method(sample), sample)
 
 
-def _plane(height: int = 32, width: int = 48) -> Tensor:
-    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
-    return 8 + 0.05 * u - 0.03 * v
-
-
-def _random() -> Tensor:
+def _random():
     return 5 + 4 * _noise(32, 48, seed=2)
 
 
 @every_method
-@pytest.mark.parametrize("kernel", ["box", "nearest"])
-def test_plane_is_reproduced_exactly_under_a_photo_of_noise(method: Build, kernel: Kernel) -> None:
-    plane = _plane()
-    for scale in SCALES:
-        torch.testing.assert_close(_result(method(), _sample(plane, kernel, scale)), plane, rtol=0, atol=1e-10)
-
-
-@every_method
-def test_plane_without_slopes_is_reproduced_to_a_low_resolution_pixels_rise_away_from_the_border(method: Build) -> None:
-    plane = _plane(64, 64)
-    error = (_result(method(slopes=False), _sample(plane)) - plane).abs()[16:-16, 16:-16]
+def test_plane_without_slopes_is_reproduced_to_a_low_resolution_pixels_rise_away_from_the_border(method):
+    flat = plane(64, 64)
+    error = (_result(method(slopes=False), _sample(flat)) - flat).abs()[16:-16, 16:-16]
     assert 1e-3 < float(error.max()) < 4 * (0.05 + 0.03)
 
 
 @every_method
-def test_hole_in_a_plane_is_filled_with_the_plane(method: Build) -> None:
-    holed = _plane()
-    holed[8:24, 12:32] = torch.nan
-    torch.testing.assert_close(_result(method(fill_holes=True), _sample(holed)), _plane(), rtol=0, atol=1e-10)
-
-
-@every_method
 @pytest.mark.parametrize("slopes", [True, False])
-def test_methods_are_equivariant_to_scale_and_offset_of_disparity(method: Build, slopes: bool) -> None:
+def test_methods_are_equivariant_to_scale_and_offset_of_disparity(method, slopes):
     fine = _result(method(slopes=slopes), _sample(_random()))
     moved = _result(method(slopes=slopes), _sample(2 * _random() + 7))
     torch.testing.assert_close(moved, 2 * fine + 7, rtol=0, atol=1e-10)
 
 
 @every_method
-@pytest.mark.parametrize("fill", [True, False])
-def test_holes_are_where_the_nearest_low_resolution_pixel_is_missing_unless_filled(method: Build, fill: bool) -> None:
-    holed = _random()
-    holed[4:12, 8:16] = torch.nan
-    holed[28:, :4] = torch.nan
-    sample = _sample(holed)
-    expected = np.kron(sample.mask_lr[0].numpy(), np.ones((4, 4), dtype=bool))
-    assert (~expected).sum() == 80
-    np.testing.assert_array_equal(_result(method(fill_holes=fill), sample).isfinite().numpy(), expected | fill)
-
-
-@every_method
-def test_result_without_slopes_lies_between_the_valid_values(method: Build) -> None:
+def test_result_without_slopes_lies_between_the_valid_values(method):
     """A hole that counted as 0 would pull its surroundings below 5."""
     flat = torch.full((32, 48), 5.0).double()
     flat[8:20, 12:32] = torch.nan
@@ -104,7 +136,7 @@ def test_result_without_slopes_lies_between_the_valid_values(method: Build) -> N
 
 
 @every_method
-def test_single_valid_low_resolution_pixel_is_enough(method: Build) -> None:
+def test_single_valid_low_resolution_pixel_is_enough(method):
     lonely = torch.full((32, 48), torch.nan).double()
     lonely[8:12, 8:12] = 5.0
     fine = _result(method(fill_holes=True), _sample(lonely))
@@ -112,7 +144,7 @@ def test_single_valid_low_resolution_pixel_is_enough(method: Build) -> None:
 
 
 @every_method
-def test_result_is_positive_depth_even_where_far_and_near_meet(method: Build) -> None:
+def test_result_is_positive_depth_even_where_far_and_near_meet(method):
     disparity = torch.where(torch.arange(48) % 16 < 8, 0.01, 40.0).double().expand(32, 48)
     sample = _sample(disparity)
     fine = method()(sample)
@@ -120,19 +152,16 @@ def test_result_is_positive_depth_even_where_far_and_near_meet(method: Build) ->
     assert float(fine.max()) <= 4 * float(sample.depth_lr.max()) + 1e-9
 
 
-def test_slope_is_the_smaller_difference_without_the_pixel_that_mixes_a_step() -> None:
+def test_slope_is_the_smaller_difference_without_a_pixel_that_mixes_a_step_or_is_a_hole():
     values = torch.tensor([[0.0, 1.0, 2.0, 6.0, 10.0, 11.0, 12.0, 11.0, 10.0]]).double()
     expected = torch.tensor([[1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, -1.0, -1.0]]).double()
     torch.testing.assert_close(estimate_slopes(values, 1), expected)
     torch.testing.assert_close(estimate_slopes(values.T, 0), expected.T)
+    pierced = torch.tensor([0.0, 2.0, 4.0, torch.nan, 9.0, 12.0, 15.0]).double()
+    torch.testing.assert_close(estimate_slopes(pierced, 0), torch.tensor([2.0, 2.0, 2.0, 2.0, 3.0, 3.0, 3.0]).double())
 
 
-def test_slope_beside_a_hole_is_the_remaining_difference() -> None:
-    values = torch.tensor([0.0, 2.0, 4.0, torch.nan, 9.0, 12.0, 15.0]).double()
-    torch.testing.assert_close(estimate_slopes(values, 0), torch.tensor([2.0, 2.0, 2.0, 2.0, 3.0, 3.0, 3.0]).double())
-
-
-def _by_regression(guide: Tensor, values: Tensor, radius: int, epsilon: float, weight: Tensor) -> np.ndarray:
+def _by_regression(guide, values, radius, epsilon, weight):
     """Fit each window by weighted ridge regression (numpy's lstsq), then average the fits."""
     colours, p, w = guide.numpy(), values.numpy(), weight.numpy()
     height, width = p.shape
@@ -156,7 +185,7 @@ def _by_regression(guide: Tensor, values: Tensor, radius: int, epsilon: float, w
 
 @pytest.mark.parametrize("radius", [1, 3])
 @pytest.mark.parametrize("holes", [False, True])
-def test_guided_filter_is_the_mean_of_each_windows_ridge_regression(radius: int, holes: bool) -> None:
+def test_guided_filter_is_the_mean_of_each_windows_ridge_regression(radius, holes):
     guide, values, weight = _noise(3, 16, 16), _noise(16, 16, seed=1), torch.ones(16, 16).double()
     if holes:
         weight = _noise(16, 16, seed=2)
@@ -165,38 +194,19 @@ def test_guided_filter_is_the_mean_of_each_windows_ridge_regression(radius: int,
     np.testing.assert_allclose(result, _by_regression(guide, values, radius, 1e-3, weight), rtol=0, atol=1e-9)
 
 
-def test_guided_filter_under_a_constant_photo_is_the_box_filter_twice() -> None:
-    impulse = torch.zeros(1, 15, 15).double()
-    impulse[0, 7, 7] = 1
-    tent = torch.tensor([1.0, 2.0, 3.0, 2.0, 1.0]).double() / 9
-    result = guided_filter(torch.full((3, 15, 15), 0.4).double(), impulse, 1, 1e-3, torch.ones(15, 15).double())[0]
-    torch.testing.assert_close(result[5:10, 5:10], tent[:, None] * tent, rtol=0, atol=1e-15)
-
-
-def test_blurred_step_along_a_photo_edge_becomes_sharp() -> None:
-    """Half of it, as the windows that straddle the edge disagree."""
-    columns = torch.arange(64).double().expand(64, 64)
-    rgb = torch.where(columns < 32, 0.2, 0.8).expand(3, 64, 64).contiguous()
-    blurred = ((columns - 27.5) / 8).clamp(0, 1)
-    sharp = guided_filter(rgb, blurred[None], 8, 1e-4, torch.ones_like(blurred))[0]
-    before, after = ((each[:, 32] - each[:, 31]) for each in (blurred, sharp))
-    torch.testing.assert_close(before, torch.full_like(before, 1 / 8))
-    assert float(after.min()) > 0.5
-
-
 @pytest.mark.parametrize("method", [JointBilateral, FastGlobalSmoother])
 @pytest.mark.parametrize("slopes", [True, False])
-def test_step_along_a_photo_edge_stays_sharp_within_a_low_resolution_pixel(method: Build, slopes: bool) -> None:
+def test_step_along_a_photo_edge_stays_sharp_within_a_low_resolution_pixel(method, slopes):
     columns = torch.arange(64).expand(48, 64)
     rgb = torch.where(columns < 32, 0.2, 0.8).double().expand(3, 48, 64).contiguous()
     truth = torch.where(columns < 32, 5.0, 9.0).double()
     sample = _sample(truth, rgb=rgb)
     assert float((_result(method(slopes=slopes), sample) - truth).abs().max()) < 1e-6
-    bilinear = to_range(Interpolation("bilinear")(sample), sample.camera, "disparity")[0]
+    bilinear = _result(Interpolation("bilinear"), sample)
     assert float((bilinear - truth).abs().max()) > 1
 
 
-def _by_neighbours(sample: DepthSample, radius: int, sigma_space: float, sigma_colour: float) -> np.ndarray:
+def _by_neighbours(sample, radius, sigma_space, sigma_colour):
     """Sum over the neighbours of each HR pixel, LR pixel (i, j) lying at its block's centre."""
     coarse = to_range(sample.depth_lr, sample.camera_lr, "disparity")[0].numpy() * 4
     rgb = sample.rgb.numpy()
@@ -220,9 +230,7 @@ def _by_neighbours(sample: DepthSample, radius: int, sigma_space: float, sigma_c
 
 @pytest.mark.parametrize(("radius", "sigma_space", "sigma_colour"), [(1, 0.5, 0.1), (2, 1.0, 0.3)])
 @pytest.mark.parametrize("holes", [False, True])
-def test_joint_bilateral_is_the_mean_weighted_by_distance_and_colour(
-    radius: int, sigma_space: float, sigma_colour: float, holes: bool
-) -> None:
+def test_joint_bilateral_is_the_mean_weighted_by_distance_and_colour(radius, sigma_space, sigma_colour, holes):
     disparity = 5 + 4 * _noise(16, 16)
     if holes:
         disparity[4:8, 8:12] = torch.nan
@@ -233,7 +241,7 @@ def test_joint_bilateral_is_the_mean_weighted_by_distance_and_colour(
     np.testing.assert_allclose(_result(method, sample), expected, rtol=1e-10)
 
 
-def _line(colours: np.ndarray, values: np.ndarray, strength: float, sigma: float) -> np.ndarray:
+def _line(colours, values, strength, sigma):
     """Solve one line, colours (3, L), as a dense system."""
     system = np.eye(len(values))
     for k in range(len(values) - 1):
@@ -242,7 +250,7 @@ def _line(colours: np.ndarray, values: np.ndarray, strength: float, sigma: float
     return np.linalg.solve(system, values)
 
 
-def _by_dense_systems(guide: Tensor, values: Tensor, strength: float, sigma: float) -> np.ndarray:
+def _by_dense_systems(guide, values, strength, sigma):
     colours, u = guide.numpy(), values.numpy().copy()
     for share in (24 / 63, 6 / 63, 1.5 / 63):  # 3/2 * 4^(3 - t) / (4^3 - 1)
         for i in range(u.shape[0]):
@@ -252,14 +260,14 @@ def _by_dense_systems(guide: Tensor, values: Tensor, strength: float, sigma: flo
     return u
 
 
-def test_smoother_solves_rows_then_columns_three_times_with_the_papers_lambdas() -> None:
+def test_smoother_solves_rows_then_columns_three_times_with_the_papers_lambdas():
     guide, values = _noise(3, 16, 13), _noise(16, 13, seed=1)
     result = smooth(guide, values[None], 30.0, 0.3, 3)[0]
     np.testing.assert_allclose(result, _by_dense_systems(guide, values, 30.0, 0.3), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("length", [1, 2, 9])
-def test_smoother_solves_lines_of_any_length(length: int) -> None:
+def test_smoother_solves_lines_of_any_length(length):
     weights, right = _noise(length - 1, 4), _noise(length, 2, 4, seed=1)
     result = solve_lines(weights, right)
     for m in range(4):
@@ -270,7 +278,7 @@ def test_smoother_solves_lines_of_any_length(length: int) -> None:
 
 
 @pytest.mark.parametrize("kernel", ["box", "nearest"])
-def test_result_is_the_smoothed_data_divided_by_the_smoothed_index_map(kernel: Kernel) -> None:
+def test_result_is_the_smoothed_data_divided_by_the_smoothed_index_map(kernel):
     disparity = 5 + 4 * _noise(16, 16, seed=3)
     disparity[4:8, 8:12] = torch.nan
     rgb = _noise(3, 16, 16)
@@ -286,21 +294,7 @@ def test_result_is_the_smoothed_data_divided_by_the_smoothed_index_map(kernel: K
     np.testing.assert_allclose(_result(method, sample), total / weight, rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("method", "name"),
-    [
-        (Bilateral, "window"), (Bilateral, "sigma_depth"), (Bilateral, "sigma_space"),
-        (GuidedFilter, "radius"), (GuidedFilter, "epsilon"),
-        (JointBilateral, "radius"), (JointBilateral, "sigma_space"), (JointBilateral, "sigma_colour"),
-        (FastGlobalSmoother, "smoothness"), (FastGlobalSmoother, "sigma_colour"), (FastGlobalSmoother, "iterations"),
-    ],
-)  # fmt: skip
-def test_parameter_that_is_not_positive_is_refused(method: Build, name: str) -> None:
-    with pytest.raises(ValueError, match=rf"^{name}: expected a positive number, got 0"):
-        method(**{name: 0})
-
-
 @pytest.mark.parametrize(("method", "name"), [(Bilateral, "window"), (GuidedFilter, "radius")])
-def test_window_that_no_map_needs_is_refused(method: Build, name: str) -> None:
-    with pytest.raises(ValueError, match=rf"^{name}: expected at most 1024 low-resolution pixels, got 2000"):
+def test_window_that_no_map_needs_is_refused(method, name):
+    with pytest.raises(ValueError, match=rf"^{name}: expected"):
         method(**{name: 2000})

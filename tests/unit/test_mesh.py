@@ -1,4 +1,4 @@
-"""Meshes of depth maps: planes stay whole, steps are cut, faces look at the camera, limits are kept."""
+"""Meshes of depth maps, and the mesh fused of several: planes stay whole, steps are cut, faces look at the camera."""
 
 import math
 import sys
@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from dsr.geometry import mesh as mesh_module
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import project, select_points, simplify, thin, triangulate, vertex_normals
-from dsr.io.exports import Written, write_cloud, write_mesh
+from dsr.geometry.poses import PosedMap
+from dsr.geometry.tsdf import fuse_maps
+from dsr.io.exports import write_mesh
 
 CAMERA = Camera(40, 30, 50, 50, 19.5, 14.5)
 
@@ -56,13 +59,6 @@ def test_wall_mesh_has_two_triangles_per_square_and_the_area_of_the_wall():
     assert mesh.faces.dtype == np.int32
     areas = np.linalg.norm(face_normals(mesh)[0], axis=1) / 2
     assert areas.sum() == pytest.approx(39 * 29 * (2 / 50) ** 2)
-
-
-def test_vertices_are_the_back_projected_pixels():
-    depth = wall() + 2e-4 * torch.arange(1200).view(1, 30, 40)
-    mesh = triangulate(depth, CAMERA)
-    points = (CAMERA.rays() * depth).flatten(1).T.numpy()
-    np.testing.assert_allclose(mesh.vertices, points[mesh.pixels], rtol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -110,31 +106,14 @@ def test_step_of_three_percent_is_cut_and_one_of_one_percent_is_not(step, cut, t
     assert (spans(mesh, depth) < 1e-6) == cut
 
 
-def test_step_on_a_floor_is_cut():
-    camera = Camera(20, 120, 400, 400, 9.5, 14.5)
-    depth = floor(camera).clone()
-    depth[0, 60:, 10:] /= 1.2  # a box on the floor
-    mesh = triangulate(depth, camera)
-    columns = mesh.pixels[mesh.faces] % 20
-    rows = mesh.pixels[mesh.faces] // 20
-    across = (columns.min(axis=1) == 9) & (columns.max(axis=1) == 10)
-    assert not (across & (rows.min(axis=1) >= 60)).any()
-    assert across.sum() == 2 * (60 - 15) - 1  # one more is cut at the box's corner
-
-
-def test_step_smeared_over_three_pixels_leaves_no_connecting_faces():
-    depth = wall()
-    depth[0, :, 18:20] = torch.tensor([2.35, 2.7])
-    depth[0, :, 20:] = 3
-    mesh = triangulate(depth, CAMERA)
-    assert spans(mesh, depth) < 1e-6
+def test_step_smeared_over_three_pixels_and_a_pole_of_one_leave_no_connecting_faces():
+    smeared, pole = wall(), wall()
+    smeared[0, :, 18:20] = torch.tensor([2.35, 2.7])
+    smeared[0, :, 20:], pole[0, :, 20] = 3, 1.5
+    mesh = triangulate(smeared, CAMERA)
+    assert spans(mesh, smeared) < 1e-6
     assert set(np.unique(mesh.vertices[:, 2])) == {2.0, 3.0}
-
-
-def test_pole_of_one_pixel_is_cut_free_and_dropped():
-    depth = wall()
-    depth[0, :, 20] = 1.5
-    mesh = triangulate(depth, CAMERA)
+    mesh = triangulate(pole, CAMERA)
     assert (mesh.vertices[:, 2] == 2).all()
     assert len(mesh.faces) == 2 * 29 * 37
 
@@ -161,18 +140,18 @@ def test_three_valid_pixels_of_a_square_make_a_triangle():
 
 def test_diagonal_follows_the_smaller_change_of_depth():
     depth = torch.tensor([[[2.0, 2.03], [2.01, 2.0]]])
-    mesh = triangulate(depth, Camera(2, 2, 5, 5, 0.5, 0.5))
-    assert all({0, 3} <= set(face) for face in mesh.faces.tolist())
-    mesh = triangulate(depth.flip(-1), Camera(2, 2, 5, 5, 0.5, 0.5))
-    assert all({1, 2} <= set(face) for face in mesh.faces.tolist())
+    for values, ends in ((depth, {0, 3}), (depth.flip(-1), {1, 2})):
+        assert all(ends <= set(face) for face in triangulate(values, Camera(2, 2, 5, 5, 0.5, 0.5)).faces.tolist())
 
 
-@pytest.mark.parametrize("stride", [1, 2, 3, 7])
-def test_stride_takes_every_which_row_and_column(stride):
-    mesh = triangulate(wall(), CAMERA, stride=stride, isolated=True)
+@pytest.mark.parametrize("stride", [1, 2, 7])
+def test_vertices_are_the_back_projected_pixels_of_every_which_row_and_column(stride):
+    depth = wall() + 2e-4 * torch.arange(1200).view(1, 30, 40)
+    mesh = triangulate(depth, CAMERA, stride=stride, isolated=True)
     assert len(mesh.vertices) == len(range(0, 30, stride)) * len(range(0, 40, stride))
-    points = (CAMERA.rays() * 2).flatten(1).T.numpy()
+    points = (CAMERA.rays() * depth).flatten(1).T.numpy()
     np.testing.assert_allclose(mesh.vertices, points[mesh.pixels], rtol=1e-6, atol=1e-7)
+    assert triangulate(wall(torch.nan), CAMERA, stride=stride).faces.shape == (0, 3)
 
 
 def test_strips_of_rows_and_triangles_leave_no_seam(monkeypatch):
@@ -183,12 +162,6 @@ def test_strips_of_rows_and_triangles_leave_no_seam(monkeypatch):
     strips = triangulate(depth, CAMERA)
     np.testing.assert_array_equal(strips.faces, whole.faces)
     np.testing.assert_allclose(vertex_normals(strips), normals, atol=1e-6)
-
-
-def test_mesh_of_holes_is_empty():
-    mesh = triangulate(wall(torch.nan), CAMERA)
-    assert mesh.vertices.shape == (0, 3)
-    assert mesh.faces.shape == (0, 3)
 
 
 HEIGHT, WIDTH = 150, 210
@@ -286,12 +259,6 @@ def wavy():
     return (2 + 0.05 * torch.sin(rows / 5) * torch.cos(columns / 6))[None]
 
 
-def test_project_undoes_the_rays():
-    mesh = triangulate(wavy(), SMALL)
-    places = project(mesh.vertices, SMALL)
-    np.testing.assert_allclose(places, np.stack((mesh.pixels % 40, mesh.pixels // 40), axis=1), atol=1e-4)
-
-
 def test_simplify_keeps_the_surface_and_its_outline():
     pytest.importorskip("fast_simplification")
     mesh = triangulate(wavy(), SMALL)
@@ -325,14 +292,6 @@ def test_select_points_are_close_to_the_limit_and_spread_evenly(most):
         assert np.diff(places).max() - np.diff(places).min() <= 1
 
 
-def test_full_density_is_written_by_default(tmp_path):
-    photo = torch.rand(3, 30, 40)
-    assert write_mesh(tmp_path / "m.ply", photo, wavy(), SMALL) == Written(TRIANGLES, TRIANGLES)
-    assert write_cloud(tmp_path / "c.ply", photo, wavy(), SMALL) == Written(1200, 1200)
-    assert len(trimesh.load(tmp_path / "m.ply", process=False).faces) == TRIANGLES
-    assert len(trimesh.load(tmp_path / "c.ply").vertices) == 1200
-
-
 def test_simplified_mesh_is_read_back_with_the_photo_at_its_place(tmp_path):
     pytest.importorskip("fast_simplification")
     columns = torch.arange(40.0).expand(30, 40) / 39
@@ -352,6 +311,75 @@ def test_simplified_mesh_is_read_back_with_the_photo_at_its_place(tmp_path):
 def test_mesh_without_the_library_says_its_stride(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "fast_simplification", None)
     written = write_mesh(tmp_path / "m.ply", torch.rand(3, 30, 40), wavy(), SMALL, most=600)
-    assert written.before == TRIANGLES
-    assert 0 < written.after <= 600
-    assert written.how.startswith("a stride of 2 pixels; pip install -e '.[mesh]' in a checkout simplifies")
+    assert (written.before, 0 < written.after <= 600) == (TRIANGLES, True)
+    assert written.how.startswith("a stride of 2 pixels; pip install")
+
+
+TURNING = Camera.centred(96, 80, 110.0)
+CENTRE, RADIUS = np.array([0.1, -0.2, 2.0]), 0.5
+
+
+def seen(turn):
+    """Return the sphere from a camera that is turned about it by some degrees."""
+    turned = Rotation.from_euler("y", turn, degrees=True).as_matrix()
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turned, CENTRE - turned @ np.array([0, 0, 2.0])
+    rays = TURNING.rays().numpy()
+    half, square = 2.0 * rays[2], (rays**2).sum(0)
+    root = half**2 - square * (4.0 - RADIUS**2)
+    depth = np.where(root > 0, (half - np.sqrt(np.maximum(root, 0))) / square, np.nan)
+    return PosedMap(depth, TURNING, pose)
+
+
+def test_fused_mesh_lies_on_the_sphere_and_faces_outward():
+    views = [seen(turn) for turn in (0, 40, -40, 80)]
+    mesh = fuse_maps(lambda: views, 0.02)
+    off = np.linalg.norm(mesh.vertices - CENTRE, axis=1) - RADIUS
+    assert np.abs(off).mean() < 0.003
+    assert np.abs(off).max() < 0.03  # less than two voxels, at the rims
+    outward = (mesh.vertices - CENTRE) / np.linalg.norm(mesh.vertices - CENTRE, axis=1, keepdims=True)
+    assert ((mesh.normals * outward).sum(1) > 0).mean() > 0.98
+    corners = mesh.vertices[mesh.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert ((across * (corners.mean(1) - CENTRE)).sum(1) > 0).mean() > 0.98
+    assert len(mesh.faces) > 3000
+
+
+def test_surface_in_a_layer_of_voxels_is_found():
+    """At 2 m, where voxels of 5 cm and blocks of eight begin, distances are exactly 0."""
+    wall = PosedMap(np.full((80, 96), 2.0), TURNING, np.eye(4))
+    mesh = fuse_maps(lambda: [wall], 0.05)
+    assert np.abs(mesh.vertices[:, 2] - 2).max() < 1e-3
+    assert len(mesh.faces) > 500
+
+
+def test_layers_of_blocks_are_joined():
+    mesh = fuse_maps(lambda: [seen(0)], 0.02)
+    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    _, count = np.unique(edges, axis=0, return_counts=True)
+    assert count.max() == 2
+    inner = np.linalg.norm(mesh.vertices[:, :2] - CENTRE[:2], axis=1) < 0.6 * RADIUS
+    border = np.unique(np.unique(edges, axis=0)[count == 1])
+    assert not inner[border].any()  # no seam in the middle
+
+
+def test_maps_are_weighted_by_their_expected_errors():
+    near = seen(0)
+    far = near._replace(depth=near.depth + 0.02)
+    sure, unsure = np.full(near.depth.shape, 0.001), np.full(near.depth.shape, 0.1)
+    middle = {}
+    for name, deviations in (("near", (sure, unsure)), ("far", (unsure, sure)), ("both", (sure, sure))):
+        views = [near._replace(deviation=deviations[0]), far._replace(deviation=deviations[1])]
+        vertices = fuse_maps(lambda views=views: views, 0.02).vertices
+        axis = np.linalg.norm(vertices[:, :2] - CENTRE[:2], axis=1) < 0.05
+        middle[name] = vertices[axis, 2].mean()
+    assert middle["far"] - middle["near"] == pytest.approx(0.02, abs=0.003)
+    assert middle["both"] == pytest.approx((middle["near"] + middle["far"]) / 2, abs=0.002)
+
+
+@pytest.mark.parametrize(
+    ("voxel", "message"), [(0.0, "positive"), (1e-4, "at least about"), (float("nan"), "positive")]
+)
+def test_impossible_voxels_are_refused(voxel, message):
+    with pytest.raises(ValueError, match=f"voxel: .*{message}"):
+        fuse_maps(lambda: [seen(0)], voxel)

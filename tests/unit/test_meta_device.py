@@ -5,8 +5,6 @@ a tensor that was left on the CPU.
 """
 
 import contextlib
-from collections.abc import Iterator
-from typing import Any
 from unittest import mock
 
 import pytest
@@ -28,7 +26,7 @@ from dsr.metrics.classes import visual_metrics
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.losses import VisualLoss
 from dsr.sample import CENTIMETRES, Unit
-from dsr.training.degradation import Batch, to_tensors
+from dsr.training.degradation import to_tensors
 from dsr.training.module import SuperResolution
 from dsr.training.objective import DepthObjective, SurfaceObjective
 
@@ -41,7 +39,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*the `self.trainer` reference i
 
 
 @pytest.fixture(autouse=True)
-def _meta_is_not_autocast() -> Iterator[None]:
+def _meta_is_not_autocast():
     """``torch.autocast`` knows no such device."""
     real = torch.autocast
     named = lambda kind, *args, **more: contextlib.nullcontext() if kind == "meta" else real(kind, *args, **more)  # noqa: E731
@@ -49,7 +47,7 @@ def _meta_is_not_autocast() -> Iterator[None]:
         yield
 
 
-def _batch() -> Batch:
+def _batch():
     """Return two patches with holes on the CPU, of one of which the kernel is given."""
     disparity, photo = step(64)
     patch = to_tensors(sample_of(disparity, photo))
@@ -59,17 +57,17 @@ def _batch() -> Batch:
     return default_collate([{**patch, **hints, "facts": encode_facts(kernel)} for kernel in ("box", None)])
 
 
-def _on_meta(batch: Any) -> Any:
+def _on_meta(batch):
     return move_data_to_device(batch, META)
 
 
-def _maps(*, differentiable: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+def _maps(*, differentiable=False):
     """Return a prediction, a target and rays of 40 x 40 pixels without values."""
     prediction, target = (torch.empty(2, 1, 40, 40, dtype=torch.float64, device=META) for _ in range(2))
     return prediction.requires_grad_(differentiable), target, torch.empty(1, 3, 40, 40, device=META)
 
 
-def test_a_value_that_is_read_is_an_error() -> None:
+def test_a_value_that_is_read_is_an_error():
     for read in (Tensor.item, Tensor.tolist, Tensor.nonzero, lambda x: bool(x.all()), lambda x: x[x > 0]):
         with pytest.raises(RuntimeError):
             read(torch.empty(1, device=META))
@@ -78,7 +76,7 @@ def test_a_value_that_is_read_is_an_error() -> None:
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_training_step_reads_no_value(name: str) -> None:
+def test_training_step_reads_no_value(name):
     net = NETWORKS[name](4)
     objective = SurfaceObjective() if net.states_errors else DepthObjective("lap1", 0.1, shading=0.1)
     module = SuperResolution(net, objective).to(META)
@@ -87,13 +85,13 @@ def test_training_step_reads_no_value(name: str) -> None:
     optimizer = torch.optim.AdamW(module.net.parameters())
     optimizer.defaults["fused"] = True  # as trainings have it; torch has no such kernel for tensors without values
     module.configure_gradient_clipping(optimizer, 1.0, "norm")
-    del optimizer.found_inf  # type: ignore[attr-defined]
+    del optimizer.found_inf
     module.optimizer_step(0, 0, optimizer, lambda: None)
 
 
 @pytest.mark.parametrize("visual", ["mse_v", "dssim", "lpips"])
 @pytest.mark.parametrize("depth_loss", ["lap1", "l1", "mse"])
-def test_loss_of_a_training_reads_no_value(depth_loss: Any, visual: Any) -> None:
+def test_loss_of_a_training_reads_no_value(depth_loss, visual):
     batch = _on_meta(_batch())
     disparity = torch.empty_like(batch["depth"], requires_grad=True)
     loss = VisualLoss(visual, random_lpips() if visual == "lpips" else None)
@@ -102,7 +100,7 @@ def test_loss_of_a_training_reads_no_value(depth_loss: Any, visual: Any) -> None
 
 
 @pytest.mark.parametrize("metric", METRICS, ids=lambda metric: metric.name)
-def test_metric_reads_no_value(metric: Any) -> None:
+def test_metric_reads_no_value(metric):
     [metric] = [each for each in catalogue(random_lpips(), protocols=VALIDATED) if each.name == metric.name]
     unit = CENTIMETRES if metric.unit is None else Unit(metric.unit, inverse=True, factor=30.0, offset=0.0)
     pair = SurfacePair(*_maps(differentiable=True), unit=unit)
@@ -111,7 +109,7 @@ def test_metric_reads_no_value(metric: Any) -> None:
     metric.valid_fraction(pair)
 
 
-def test_collection_of_metrics_reads_no_value() -> None:
+def test_collection_of_metrics_reads_no_value():
     metrics = visual_metrics(random_lpips(), protocols=VALIDATED).to(META)
     assert all(value.is_meta for value in metrics(*_maps()).values())
     assert all(value.is_meta for value in metrics.compute().values())
@@ -119,13 +117,13 @@ def test_collection_of_metrics_reads_no_value() -> None:
 
 
 @pytest.mark.parametrize("name", PEERS)
-def test_peers_read_no_value(name: str) -> None:
+def test_peers_read_no_value(name):
     net = PEERS[name](4).to(META)
     net(torch.empty(1, 3, 64, 64, device=META), torch.empty(1, 1, 64, 64, device=META)).sum().backward()
 
 
 @pytest.mark.parametrize("loss", [{}, {"data_loss": "mse", "w": 0.0}])
-def test_step_of_a_deep_image_prior_reads_no_value(loss: dict[str, Any]) -> None:
+def test_step_of_a_deep_image_prior_reads_no_value(loss):
     prior = DeepImagePrior(scale=4, downsampling=Downsampling("box"), **loss)
     module = PriorOptimisation(prior, sample_of(*step(64)), visual=True)
     for name, value in vars(module).items():

@@ -6,13 +6,11 @@ import math
 import numpy as np
 import pytest
 import torch
-from depth_steps import CAMERA, UNKNOWN, Array, holed, pair_of, steps
-from torch import Tensor
+from depth_steps import CAMERA, UNKNOWN, holed, pair_of, steps
 
 from dsr.geometry.camera import Camera
 from dsr.metrics import boundaries
 from dsr.metrics.catalogue import catalogue, score_image
-from dsr.metrics.functional import SurfacePair
 
 METRICS = tuple(each for each in catalogue(protocols=("boundaries",)) if each.region is None)
 THRESHOLDS = np.linspace(1.05, 1.25, 10)
@@ -20,19 +18,19 @@ THRESHOLDS = np.linspace(1.05, 1.25, 10)
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def _scores(pair: SurfacePair) -> dict[str, float]:
+def _scores(pair):
     return {metric.name: metric.function(pair).item() for metric in METRICS}
 
 
-def _flat(height: int, width: int, near: float = 2.0) -> Array:
+def _flat(height, width, near=2.0):
     return np.full((height, width), near)
 
 
-def _mask(array: Array) -> Tensor:
+def _mask(array):
     return torch.from_numpy(array.astype(bool))[None, None]
 
 
-def test_f1_is_that_of_the_authors_code() -> None:
+def test_f1_is_that_of_the_authors_code():
     """Executed: apple/ml-depth-pro 9efe5c1, with NaN for unknown truth in both, and microsoft/MoGe 0744441, masked."""
     assert boundaries.depth_pro_scores(pair_of(*steps()))["F1"].item() == pytest.approx(0.9412966260255751, abs=1e-9)
     assert boundaries.depth_pro_scores(pair_of(*holed()))["F1"].item() == pytest.approx(0.9410074986768165, abs=1e-9)
@@ -42,7 +40,7 @@ def test_f1_is_that_of_the_authors_code() -> None:
     )
 
 
-def test_ceiling_is_the_truth_against_itself() -> None:
+def test_ceiling_is_the_truth_against_itself():
     _, truth = holed()
     few = _flat(8, 9)
     few[:, 4:], few[2:, 7:] = 2.3, 2.6
@@ -53,7 +51,7 @@ def test_ceiling_is_the_truth_against_itself() -> None:
         assert boundaries.depth_pro_scores(pair_of(*steps()))["ceiling"].item() == 1
 
 
-def test_f1_of_a_step_is_a_count() -> None:
+def test_f1_of_a_step_is_a_count():
     """A step of 1.1 is above three thresholds of Depth Pro, in one of four directions; half of it is displaced."""
     truth = _flat(10, 12)
     truth[:, 6:] *= 1.1
@@ -70,13 +68,13 @@ def test_f1_of_a_step_is_a_count() -> None:
     assert boundaries.moge_scores(pair)["1"].item() == pytest.approx(2 * 4 / (8 + 9) * share)
 
 
-def test_boundary_error_is_that_of_the_authors_code() -> None:
+def test_boundary_error_is_that_of_the_authors_code():
     """Executed: Koch's v0.9 in bulatko/DepthART b2bc093, ``compute_depth_boundary_error``, 0 for holes."""
     prediction, truth = steps()
     edges = np.zeros_like(truth)
     edges[:, 24::24] = edges[18::18] = 1
 
-    def errors(depth: Array, true: Tensor) -> list[float]:
+    def errors(depth, true):
         found = boundaries.depth_boundaries(torch.from_numpy(depth)[None, None])
         return [each.item() for each in boundaries.depth_boundary_error(found, true)]
 
@@ -94,7 +92,7 @@ def test_boundary_error_is_that_of_the_authors_code() -> None:
     assert [found["DBE_accuracy"], found["DBE_completeness"]] == errors(prediction, own)
 
 
-def test_boundary_error_is_a_distance() -> None:
+def test_boundary_error_is_a_distance():
     found, true = np.zeros((40, 60)), np.zeros((40, 60))
     true[:, 30], found[:, 33], found[:, 45] = 1, 1, 1  # the second is of no true boundary
     assert [each.item() for each in boundaries.depth_boundary_error(_mask(found), _mask(true))] == [3, 3]
@@ -111,19 +109,19 @@ def test_boundary_error_is_a_distance() -> None:
     assert completeness.item() == pytest.approx(np.minimum(15, np.hypot(9, np.arange(40))).mean())
 
 
-def test_directed_error_is_that_of_the_authors_code_from_a_metre_on() -> None:
+def test_directed_error_is_that_of_the_authors_code_from_a_metre_on():
     """Executed: the same file's ``compute_directed_depth_error`` of the pixels with a truth."""
     found = boundaries.directed_depth_error(pair_of(*holed()))
     assert list(found.values()) == pytest.approx([0.95440552, 0.00244161, 0.04315287], abs=1e-8)
 
 
-def _planarity(prediction: Array, truth: Array, planes: Array, camera: Camera = CAMERA) -> tuple[float, float]:
+def _planarity(prediction, truth, planes, camera=CAMERA):
     pair = pair_of(prediction, truth, camera)
     found = boundaries.planarity(pair.replaced(regions={"planes": torch.from_numpy(planes)[None, None]}))
     return found["flatness"].item(), found["orientation"].item()
 
 
-def test_planarity_is_that_of_the_authors_code() -> None:
+def test_planarity_is_that_of_the_authors_code():
     """Executed: the same file's ``compute_planarity_error``, of a large plane; another is too small."""
     planes = np.ones((120, 160), np.uint8)
     planes[:10], planes[:4] = 0, 2
@@ -134,7 +132,7 @@ def test_planarity_is_that_of_the_authors_code() -> None:
     assert angle == pytest.approx(77.97643416, rel=1e-5)
 
 
-def test_planarity_of_planes_is_exact() -> None:
+def test_planarity_of_planes_is_exact():
     camera = Camera(80, 60, 70.0, 71.0, 40.0, 30.0)
     rays = camera.rays().numpy().astype(float)
     true, tilted = np.array((0.1, 0.2, 1.0)), np.array((0.1, 0.5, 1.0))
@@ -151,7 +149,7 @@ def test_planarity_of_planes_is_exact() -> None:
     assert flatness == pytest.approx(0.01, rel=1e-2)
 
 
-def test_holes_of_a_prediction_miss_the_edges_there_and_are_reported() -> None:
+def test_holes_of_a_prediction_miss_the_edges_there_and_are_reported():
     _, truth = steps()
     prediction = truth.copy()
     full = _scores(pair_of(prediction, truth))
@@ -167,7 +165,7 @@ def test_holes_of_a_prediction_miss_the_edges_there_and_are_reported() -> None:
 
 
 @pytest.mark.parametrize("size", list(itertools.product((1, 2, 3, 6, 7), (1, 8))))
-def test_small_maps_have_the_scores_that_they_are_large_enough_for(size: tuple[int, int]) -> None:
+def test_small_maps_have_the_scores_that_they_are_large_enough_for(size):
     maps = (torch.full((1, *size), depth) for depth in (2.0, 2.1))
     rows = {row.metric: row.value for row in score_image(*maps, CAMERA.rays()[:, : size[0], : size[1]], METRICS)}
     for metric in METRICS:

@@ -5,15 +5,14 @@ import math
 import numpy as np
 import pytest
 import torch
-from depth_steps import Array, holed, pair_of, steps
+from depth_steps import holed, pair_of, steps
 from small_lpips import random_lpips
-from torch import Tensor
+from small_scenes import grid
 
 from dsr.geometry.camera import Camera
 from dsr.metrics import functional
-from dsr.metrics.catalogue import PROTOCOLS, Score, catalogue, score_image
+from dsr.metrics.catalogue import PROTOCOLS, catalogue, score_image
 from dsr.metrics.functional import SurfacePair
-from dsr.metrics.lpips import LPIPS
 
 CAMERA = Camera(width=48, height=40, fx=50.0, fy=50.0, cx=24.0, cy=20.0)
 WITHOUT_LIGHTS = {
@@ -27,25 +26,25 @@ Row = tuple[str, str]
 
 
 @pytest.fixture(scope="module")
-def network() -> LPIPS:
+def network():
     return random_lpips()
 
 
-def _maps(seed: int = 0) -> tuple[Tensor, Tensor]:
+def _maps(seed=0):
     random = np.random.default_rng(seed)
     target = 2 + 0.01 * random.random((1, 40, 48))
     prediction = target + np.linspace(0.002, 0.5, 48) * (1 + 0.02 * random.random((1, 40, 48)))
     return torch.from_numpy(prediction), torch.from_numpy(target)
 
 
-def _scores(prediction: Tensor, target: Tensor, network: LPIPS | None = None) -> dict[Row, Score]:
+def _scores(prediction, target, network=None):
     scores = list(score_image(prediction, target, CAMERA.rays(), catalogue(network)))
     rows = {(score.metric, score.variant): score for score in scores}
     assert len(rows) == len(scores)
     return rows
 
 
-def test_metrics_and_variants_are_those_of_the_paper(network: LPIPS) -> None:
+def test_metrics_and_variants_are_those_of_the_paper(network):
     variants = {"e1", "e2", "e3", "e4", "max", "avg"}
     expected = {(name, "") for name in WITHOUT_LIGHTS} | {(name, v) for name in WITH_LIGHTS for v in variants}
     assert set(_scores(*_maps(), network)) == expected
@@ -55,7 +54,7 @@ def test_metrics_and_variants_are_those_of_the_paper(network: LPIPS) -> None:
 @pytest.mark.parametrize(
     "cut", [(slice(0, 39), slice(0, 47)), (slice(2, 40), slice(0, 48)), (slice(1, 38), slice(5, 44))]
 )
-def test_pixels_outside_the_predictions_window_are_cropped_first(cut: tuple[slice, slice]) -> None:
+def test_pixels_outside_the_predictions_window_are_cropped_first(cut):
     prediction, target = _maps()
     partial = torch.full_like(prediction, torch.nan)
     partial[(..., *cut)] = prediction[(..., *cut)]
@@ -70,7 +69,7 @@ def test_pixels_outside_the_predictions_window_are_cropped_first(cut: tuple[slic
         assert row.valid_share == pytest.approx(window.height * window.width / (40 * 48), rel=1e-12)
 
 
-def test_inner_hole_is_left_out_and_each_metric_reports_its_valid_fraction() -> None:
+def test_inner_hole_is_left_out_and_each_metric_reports_its_valid_fraction():
     prediction, target = _maps()
     prediction[0, 10, 20] = torch.nan
     target[0, 30, 40] = torch.nan
@@ -88,7 +87,7 @@ def test_inner_hole_is_left_out_and_each_metric_reports_its_valid_fraction() -> 
     assert rows["DSSIM_v", "e1"].value == pytest.approx(functional.dssim_v(pair)[0, 0].item(), rel=1e-4)
 
 
-def test_holes_of_the_truth_do_not_shrink_the_window() -> None:
+def test_holes_of_the_truth_do_not_shrink_the_window():
     prediction, target = _maps()
     target[:, :4] = torch.nan
     rows = _scores(prediction, target)
@@ -101,11 +100,11 @@ every_protocol = pytest.mark.parametrize("protocol", PROTOCOLS)
 
 
 @every_protocol
-def test_scores_of_a_batch_are_those_of_its_images(protocol: str, network: LPIPS, one_thread: None) -> None:
+def test_scores_of_a_batch_are_those_of_its_images(protocol, network, one_thread):
     maps = [holed(), steps(1)]
     maps[1][0][5:9, 10:50] = np.nan
 
-    def pair(*given: Array) -> SurfacePair:
+    def pair(*given):
         found = pair_of(*given)
         errors = 0.1 * found.given[0], 10 * found.given[0]
         regions = {"planes": torch.ones_like(found.target, dtype=torch.uint8)}
@@ -120,7 +119,7 @@ def test_scores_of_a_batch_are_those_of_its_images(protocol: str, network: LPIPS
 
 
 @every_protocol
-def test_images_without_truth_or_prediction_have_no_score(protocol: str, network: LPIPS) -> None:
+def test_images_without_truth_or_prediction_have_no_score(protocol, network):
     depth, nothing = torch.full((1, 40, 48), 2.0), torch.full((1, 40, 48), torch.nan)
     metrics, errors = catalogue(network, protocols=(protocol,)), (depth, depth)
     rows = list(score_image(depth, nothing, CAMERA.rays(), metrics, errors=errors))
@@ -139,9 +138,7 @@ def test_images_without_truth_or_prediction_have_no_score(protocol: str, network
         ((6, 30), {"RMSE_d", "BadPix_d_5cm", "BadPix_v_5", "RMSE_v", "RMSE_v1", "Bumpiness_d"}),
     ],
 )
-def test_window_too_small_for_one_metric_is_scored_by_the_others(
-    network: LPIPS, size: tuple[int, int], scored: set[str]
-) -> None:
+def test_window_too_small_for_one_metric_is_scored_by_the_others(network, size, scored):
     prediction, target = _maps()
     patch = torch.full_like(prediction, torch.nan)
     window = (..., slice(5, 5 + size[0]), slice(8, 8 + size[1]))
@@ -155,7 +152,7 @@ def test_window_too_small_for_one_metric_is_scored_by_the_others(
             assert score.valid_share == 0
 
 
-def test_metrics_of_a_region_are_those_of_its_pixels_alone() -> None:
+def test_metrics_of_a_region_are_those_of_its_pixels_alone():
     target = torch.full((1, 40, 48), 2.0, dtype=torch.float64)
     prediction = target.clone()
     prediction[:, 10:20, 5:30] += 0.1
@@ -173,13 +170,16 @@ def test_metrics_of_a_region_are_those_of_its_pixels_alone() -> None:
     assert metrics[-1].format.unit.startswith("edges")
 
 
-def test_planes_of_a_region_have_a_planarity_error() -> None:
+def _half_planes():
+    """Return a wall that recedes to the right, and its upper and lower half as planes 1 and 2."""
+    v, u = grid(40, 48)
+    return 1 / (0.5 + 0.002 * (u - CAMERA.cx))[None], (1 + (v >= 20))[None].to(torch.uint8), u.remainder(2) - 0.5
+
+
+def test_planes_of_a_region_have_a_planarity_error():
     metrics = catalogue(protocols=["boundaries"])
-    v, u = torch.meshgrid(torch.arange(40).double(), torch.arange(48).double(), indexing="ij")
-    target = 1 / (0.5 + 0.002 * (u - CAMERA.cx))[None]
-    planes = (1 + (v > 20))[None].to(torch.uint8)
-    wavy = target * (1 + 0.01 * (u.remainder(2) - 0.5))
-    for prediction, flat in ((2 * target, True), (wavy, False)):
+    target, planes, wave = _half_planes()
+    for prediction, flat in ((2 * target, True), (target * (1 + 0.01 * wave), False)):
         rows = score_image(prediction, target, CAMERA.rays(), metrics, regions={"planes": planes})
         error = {row.metric: row.value for row in rows}
         assert (error["PE_flatness"] < 1e-6) == flat
@@ -188,11 +188,9 @@ def test_planes_of_a_region_have_a_planarity_error() -> None:
     assert not any(row.metric.startswith("PE_") for row in rows)
 
 
-def test_holes_neither_hide_a_bad_plane_nor_a_bad_region() -> None:
-    v, u = torch.meshgrid(torch.arange(40).double(), torch.arange(48).double(), indexing="ij")
-    target = 1 / (0.5 + 0.002 * (u - CAMERA.cx))[None]
-    planes = (1 + (v >= 20))[None].to(torch.uint8)
-    prediction = target * (1 + 0.02 * (planes == 2) * (u.remainder(2) - 0.5))
+def test_holes_neither_hide_a_bad_plane_nor_a_bad_region():
+    target, planes, wave = _half_planes()
+    prediction = target * (1 + 0.02 * (planes == 2) * wave)
     holed = prediction.masked_fill(planes == 2, torch.nan)
     glass = (planes == 2).to(torch.uint8)
     metrics = catalogue(protocols=["boundaries", "depth", "normals"], regions=["glass"])

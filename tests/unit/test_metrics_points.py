@@ -1,7 +1,6 @@
 """Flying pixels, Chamfer distance and F-score, against all pairs of points, and closed forms."""
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,12 +17,12 @@ STEP = np.where(U < 24, 1.0, 2.0)
 METRICS = catalogue(protocols=("points",))
 
 
-def _scores(prediction: Any, truth: Any) -> dict[str, float]:
+def _scores(prediction, truth):
     maps = (torch.as_tensor(each, dtype=torch.float64)[None] for each in (prediction, truth))
     return {row.metric: row.value for row in score_image(*maps, RAYS[0], METRICS)}
 
 
-def _holed(seed: int) -> tuple[Any, Any]:
+def _holed(seed):
     """Return a prediction with errors from millimetres to decimetres, and a truth with a step; both have holes."""
     phase = np.sin(0.9 * U + 1.7 * V + seed)
     truth = STEP + 0.1 * np.sin(0.3 * V)
@@ -32,7 +31,7 @@ def _holed(seed: int) -> tuple[Any, Any]:
     return prediction, truth
 
 
-def _naive(prediction: Any, truth: Any) -> dict[str, float]:
+def _naive(prediction, truth):
     rays = RAYS[0].permute(1, 2, 0).numpy()
     true, both = np.isfinite(truth), np.isfinite(truth) & np.isfinite(prediction)
     apart = cdist((prediction[..., None] * rays)[both], (truth[..., None] * rays)[true])
@@ -65,7 +64,7 @@ def _naive(prediction: Any, truth: Any) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_scores_are_those_of_all_pairs_of_points(seed: int) -> None:
+def test_scores_are_those_of_all_pairs_of_points(seed):
     prediction, truth = _holed(seed)
     found = _scores(prediction, truth)
     assert found == pytest.approx(_naive(prediction, truth), rel=1e-10)
@@ -74,7 +73,7 @@ def test_scores_are_those_of_all_pairs_of_points(seed: int) -> None:
 
 
 @pytest.mark.parametrize("gap", [0.003, 0.02, 0.2])
-def test_parallel_planes_are_as_far_apart_as_their_gap(gap: float) -> None:
+def test_parallel_planes_are_as_far_apart_as_their_gap(gap):
     """The nearest point of the other plane is straight across, up to the spacing of the pixels, 1 / 60 of the depth."""
     found = _scores(np.full_like(U, 1 + gap), np.ones_like(U))
     assert gap <= found["Points_chamfer"] < math.hypot(gap, 0.3 * gap) + 0.012
@@ -83,7 +82,7 @@ def test_parallel_planes_are_as_far_apart_as_their_gap(gap: float) -> None:
     assert found["Points_flying"] == 0  # there is no edge
 
 
-def test_only_points_in_the_void_between_surfaces_fly() -> None:
+def test_only_points_in_the_void_between_surfaces_fly():
     between = np.where(U == 24, 1.5, STEP)  # a column in the middle of the step
     assert _scores(between, STEP)["Points_flying"] == pytest.approx(1 / 48)
     assert _scores(np.where(np.abs(U - 24) < 4, np.where(U < 24, 2, 1), STEP), STEP)["Points_flying"] == 0  # moved edge
@@ -93,14 +92,7 @@ def test_only_points_in_the_void_between_surfaces_fly() -> None:
     assert _scores(np.where(U == 24, 1.04, STEP), np.where(U < 24, 1.0, 1.045))["Points_flying"] == 0  # no edge
 
 
-def test_smeared_edge_has_more_flying_pixels_the_wider_it_is() -> None:
-    shares = [_scores(np.clip(1.5 + (U - 23.5) / width, 1, 2), STEP)["Points_flying"] for width in (1, 4, 8, 16)]
-    assert shares[0] == 0
-    assert shares == sorted(shares)
-    assert shares[-1] == pytest.approx(16 / 48, abs=2 / 48)
-
-
-def test_hole_does_not_win() -> None:
+def test_hole_does_not_win():
     prediction = np.where(U == 24, 1.5, STEP)
     without = np.where(np.abs(U - 24) < 4, np.nan, STEP)
     found, holed = _scores(prediction, STEP), _scores(without, STEP)

@@ -23,15 +23,15 @@ X, Y = (U[0] - 11.5) / 30, (V[0] - 9.5) / 30
 STILL = 2 + 0.3 * np.sin(0.2 * U[0] + 0.1 * V[0])
 
 
-def _maps(values: np.ndarray) -> torch.Tensor:
+def _maps(values):
     return torch.from_numpy(np.broadcast_to(values, (len(values), 20, 24)).copy())[:, None]
 
 
-def _noisy(seed: int, frames: int = 9) -> np.ndarray:
+def _noisy(seed, frames=9):
     return STILL * (1 + 0.01 * np.random.default_rng(seed).standard_normal((frames, 20, 24)))
 
 
-def _poses(*places: tuple[float, float, float], turn: float = 0.0) -> np.ndarray:
+def _poses(*places, turn=0.0):
     """Return poses of cameras at places, each turned about the vertical by ``turn`` more than the one before."""
     found = np.tile(np.eye(4), (len(places), 1, 1))
     for number, place in enumerate(places):
@@ -40,7 +40,7 @@ def _poses(*places: tuple[float, float, float], turn: float = 0.0) -> np.ndarray
     return found
 
 
-def test_flicker_is_numpys_deviation_over_the_median_of_each_pixel() -> None:
+def test_flicker_is_numpys_deviation_over_the_median_of_each_pixel():
     depths = _noisy(0)
     ratio = depths.std(axis=0) / np.median(depths, axis=0)
     assert flicker(_maps(depths)).item() == pytest.approx(ratio.mean(), rel=1e-12)
@@ -51,14 +51,14 @@ def test_flicker_is_numpys_deviation_over_the_median_of_each_pixel() -> None:
     assert temporal_noise(_maps(depths), given).item() == pytest.approx(np.median(ratio[static]), rel=1e-12)
 
 
-def test_flicker_of_two_states_is_half_their_distance() -> None:
+def test_flicker_of_two_states_is_half_their_distance():
     states = np.where(TIME[:, :1, :1] % 2 == 0, 1.98, 2.02)
     assert flicker(_maps(states)).item() == pytest.approx(0.01)
     assert temporal_noise(_maps(states)).item() == pytest.approx(0.01)
     assert flicker(_maps(np.tile(STILL, (3, 1, 1)))).item() == pytest.approx(0, abs=1e-12)
 
 
-def test_holes_are_left_out_and_counted() -> None:
+def test_holes_are_left_out_and_counted():
     depths = _noisy(1)
     depths[2, :5], depths[3:, 5:7], depths[1:, 7] = np.nan, 0, -1
     known = np.where(depths > 0, depths, np.nan)
@@ -73,7 +73,7 @@ def test_holes_are_left_out_and_counted() -> None:
 
 
 @pytest.mark.parametrize("tilt", [2.0, 10.0])
-def test_flicker_of_normals_is_half_the_angle_between_two_planes(tilt: float) -> None:
+def test_flicker_of_normals_is_half_the_angle_between_two_planes(tilt):
     slope = math.tan(math.radians(tilt))
     planes = np.stack([2 / (1 - sign * X * slope) for sign in (1, -1, 1, -1)])
     assert normal_flicker(_maps(planes), CAMERA).item() == pytest.approx(tilt, rel=1e-6)
@@ -82,7 +82,7 @@ def test_flicker_of_normals_is_half_the_angle_between_two_planes(tilt: float) ->
     assert normal_flicker(_maps(2 + 0 * planes), CAMERA, torch.from_numpy(X > 0)[None, None]).item() < 1e-5
 
 
-def test_exact_planes_before_a_moving_camera_agree_and_scales_that_change_differ_by_their_change() -> None:
+def test_exact_planes_before_a_moving_camera_agree_and_scales_that_change_differ_by_their_change():
     places = [(0, 0, 0), (0.1, 0.05, 0), (0.15, 0.05, 0), (0.2, 0.1, 0)]
     scales = np.array([1.0, 1.01, 1.0, 1.03])
     wall = np.full((4, 20, 24), 2.0)
@@ -95,7 +95,7 @@ def test_exact_planes_before_a_moving_camera_agree_and_scales_that_change_differ
     assert opw(_maps(approach), CAMERA, _poses(*[(0, 0, 0)] * 3)).item() == pytest.approx(0.15)
 
 
-def test_warping_metric_is_that_of_scipys_interpolation_of_moved_points() -> None:
+def test_warping_metric_is_that_of_scipys_interpolation_of_moved_points():
     depths = 2 + 0.05 * np.sin(0.3 * U[:2] + 0.2 * V[:2]) + 0.02 * TIME[:2]
     poses = _poses((0, 0, 0), (0.03, -0.02, 0.05), turn=0.02)
     points = np.stack([X * depths[0], Y * depths[0], depths[0], np.ones_like(X)]).reshape(4, -1)
@@ -107,7 +107,7 @@ def test_warping_metric_is_that_of_scipys_interpolation_of_moved_points() -> Non
     assert opw(_maps(depths), CAMERA, poses).item() == pytest.approx(expected, rel=0.02)
 
 
-def test_pixels_that_change_colour_or_are_not_static_weigh_less() -> None:
+def test_pixels_that_change_colour_or_are_not_static_weigh_less():
     depths = np.full((2, 20, 24), 2.0)
     depths[1, :, 12:] = 1.9  # something has come in front of the right half
     photos = torch.full((2, 3, 20, 24), 0.5, dtype=torch.float64)
@@ -120,7 +120,7 @@ def test_pixels_that_change_colour_or_are_not_static_weigh_less() -> None:
     assert opw(_maps(depths), CAMERA, still, static=static).item() == pytest.approx(0, abs=1e-12)
 
 
-def test_photos_are_compared_where_the_points_were() -> None:
+def test_photos_are_compared_where_the_points_were():
     # the camera moves right by a pixel's width on the wall, so that what was at u is at u - 1
     wall, photos = np.full((2, 20, 24), 3.0), np.random.default_rng(7).random((2, 3, 20, 24))
     wall[1, :, 12:], photos[1, ..., :-1] = 2.7, photos[0, ..., 1:]
@@ -128,7 +128,7 @@ def test_photos_are_compared_where_the_points_were() -> None:
     assert opw(_maps(wall), CAMERA, poses, photos).item() == pytest.approx(opw(_maps(wall), CAMERA, poses).item())
 
 
-def test_temporal_gradients_are_those_of_video_depth_anything() -> None:
+def test_temporal_gradients_are_those_of_video_depth_anything():
     # TemporalGradientMatchingLoss(trim=0, temp_grad_scales=1) in loss/loss.py of DepthAnything/Video-Depth-Anything
     # (4f5ae23)
     true = 2 + 0.3 * np.sin(0.2 * U + 0.1 * V + 0.25 * TIME) + 0.05 * TIME * (U > 16)
@@ -140,7 +140,7 @@ def test_temporal_gradients_are_those_of_video_depth_anything() -> None:
     assert tgm(_maps(predicted), _maps(holes)).item() == pytest.approx(0.03060636149836996, rel=1e-12)
 
 
-def test_temporal_gradients_know_no_offset_and_have_the_size_of_a_jump() -> None:
+def test_temporal_gradients_know_no_offset_and_have_the_size_of_a_jump():
     true = np.tile(STILL, (3, 1, 1))
     assert tgm(_maps(true + 0.2), _maps(true)).item() == pytest.approx(0, abs=1e-12)
     jumps = true + np.array([0, 0.01, 0.04])[:, None, None]
@@ -151,21 +151,15 @@ def test_temporal_gradients_know_no_offset_and_have_the_size_of_a_jump() -> None
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("key", "call"),
     [
-        (
-            lambda: flicker(_maps(STILL[None])),
-            r"^depths: expected shape \(T, 1, H, W\) of two .* got \(1, 1, 20, 24\)$",
-        ),
-        (
-            lambda: flicker(_maps(_noisy(0)), torch.ones(1, 20, 24) > 0),
-            r"^static: expected shape \(1, 1, 20, 24\), got",
-        ),
-        (lambda: opw(_maps(_noisy(0)), CAMERA, _poses((0, 0, 0))), r"^poses, photos: .* 9 depth maps, got 1 poses"),
-        (lambda: opw(_maps(_noisy(0, 2)), CAMERA, 2 * _poses((0, 0, 0), (0, 0, 0))), r"^poses: 0: expected "),
-        (lambda: tgm(_maps(_noisy(0, 2)), _maps(_noisy(0, 3))), r"^target: expected shape \(2, 1, 20, 24\), got"),
+        ("depths", lambda: flicker(_maps(STILL[None]))),
+        ("static", lambda: flicker(_maps(_noisy(0)), torch.ones(1, 20, 24) > 0)),
+        ("poses, photos", lambda: opw(_maps(_noisy(0)), CAMERA, _poses((0, 0, 0)))),
+        ("poses: 0", lambda: opw(_maps(_noisy(0, 2)), CAMERA, 2 * _poses((0, 0, 0), (0, 0, 0)))),
+        ("target", lambda: tgm(_maps(_noisy(0, 2)), _maps(_noisy(0, 3)))),
     ],
 )
-def test_sequences_that_do_not_fit_together_are_refused(call, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+def test_sequences_that_do_not_fit_together_are_refused(key, call):
+    with pytest.raises(ValueError, match=f"^{key}: expected "):
         call()

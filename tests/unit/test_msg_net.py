@@ -1,13 +1,11 @@
 """MSG-Net and its pre- and post-processing, against SciPy, Pillow and its own slow ways."""
 
-import copy
 from typing import get_args
 
 import numpy as np
 import pytest
 import torch
 from scipy import ndimage
-from torch import Tensor
 
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.images import mean3x3, normalise, upsample_bicubic
@@ -17,12 +15,12 @@ from dsr.sample import DepthSample
 from dsr.utils.ratios import SCALES
 
 
-def _net(scale: int, variant: VariantName = "voynov") -> MSGNet:
+def _net(scale, variant="voynov"):
     torch.manual_seed(scale)
     return MSGNet(scale, variant).eval()
 
 
-def _scene(scale: int, height: int, width: int, batch: int = 1) -> tuple[Tensor, Tensor]:
+def _scene(scale, height, width, batch=1):
     """Return a photo and a low-resolution disparity map, random but smooth enough to resemble one."""
     generator = torch.Generator().manual_seed(height + width)
     rgb = torch.rand((batch, 3, scale * height, scale * width), generator=generator)
@@ -30,7 +28,7 @@ def _scene(scale: int, height: int, width: int, batch: int = 1) -> tuple[Tensor,
     return rgb, disparity
 
 
-def _sample(scale: int, height: int, width: int, doffs: float = 0.0) -> DepthSample:
+def _sample(scale, height, width, doffs=0.0):
     rgb, disparity = _scene(scale, height, width)
     camera = Camera(scale * width, scale * height, 600.0, 600.0, 3.0, 4.0, baseline=0.2, doffs=doffs)
     coarse = camera.rescale(width, height)
@@ -39,29 +37,21 @@ def _sample(scale: int, height: int, width: int, doffs: float = 0.0) -> DepthSam
 
 
 @pytest.mark.parametrize(("scale", "parameters"), [(4, 326_015), (8, 454_147)])
-def test_voynov_network_has_the_published_number_of_parameters(scale: int, parameters: int) -> None:
+def test_voynov_network_has_the_published_number_of_parameters(scale, parameters):
     assert sum(value.numel() for value in MSGNet(scale).parameters()) == parameters
 
 
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("size", [(1, 3), (5, 4)])
-def test_voynov_network_covers_every_pixel_and_the_hui_network_all_but_the_last(
-    scale: int, size: tuple[int, int]
-) -> None:
+def test_voynov_network_covers_every_pixel_and_the_hui_network_all_but_the_last(scale, size):
     rgb, disparity = _scene(scale, *size, batch=2)
     rows, columns = (scale * n for n in size)
     assert _net(scale).upsample(rgb, disparity).shape == (2, 1, rows, columns)
     assert _net(scale, "hui").upsample(rgb, disparity).shape == (2, 1, rows - 1, columns - 1)
 
 
-def test_hui_network_sizes_are_caffes_511_255_127() -> None:
-    net = _net(8, "hui")
-    with torch.inference_mode():
-        assert net(torch.zeros(1, 1, 511, 39), torch.zeros(1, 1, 64, 5)).shape == (1, 1, 511, 39)
-
-
 @pytest.mark.parametrize("variant", get_args(VariantName))
-def test_constant_map_stays_constant_and_an_empty_map_becomes_holes(variant: VariantName) -> None:
+def test_constant_map_stays_constant_and_an_empty_map_becomes_holes(variant):
     rgb, disparity = torch.full((2, 3, 64, 64), 0.3), torch.full((2, 1, 16, 16), 7.0, dtype=torch.float64)
     disparity[1] = torch.nan
     fine = _net(4, variant).upsample(rgb, disparity)
@@ -70,7 +60,7 @@ def test_constant_map_stays_constant_and_an_empty_map_becomes_holes(variant: Var
 
 
 @pytest.mark.parametrize("variant", ["hui", "voynov"])
-def test_guidance_is_the_published_intensity_minus_its_mean(variant: VariantName) -> None:
+def test_guidance_is_the_published_intensity_minus_its_mean(variant):
     rgb = torch.rand(1, 3, 6, 5, dtype=torch.float64)
     red, green, blue = 255 * rgb[0].numpy()
     luma = 16 + (65.481 * red + 128.553 * green + 24.966 * blue) / 255
@@ -83,7 +73,7 @@ def test_guidance_is_the_published_intensity_minus_its_mean(variant: VariantName
 
 
 @pytest.mark.parametrize("variant", get_args(VariantName))
-def test_batch_of_two_equals_two_single_images(variant: VariantName) -> None:
+def test_batch_of_two_equals_two_single_images(variant):
     net, (rgb, disparity) = _net(4, variant), _scene(4, 20, 17, batch=2)
     disparity[1] *= 3
     disparity[1, 0, 2, 3] = torch.nan
@@ -93,18 +83,10 @@ def test_batch_of_two_equals_two_single_images(variant: VariantName) -> None:
     torch.testing.assert_close(together, alone, rtol=0, atol=1e-4)  # of a range of 15
 
 
-def test_training_reaches_every_parameter_around_holes_too() -> None:
-    net, (rgb, disparity) = _net(4).train(), _scene(4, 16, 16)
-    disparity[0, 0, 2, 2] = torch.nan
-    net.upsample(rgb, disparity.requires_grad_()).square().mean().backward()
-    gradients = [disparity.grad, *(value.grad for value in net.parameters())]
-    assert all(gradient is not None and bool(gradient.isfinite().all()) for gradient in gradients)
-
-
 @pytest.mark.parametrize(
     ("scale", "height", "width"), [(2, 40, 90), (4, 64, 40), (4, 16, 33), (4, 32, 48), (8, 8, 8), (16, 20, 16)]
 )
-def test_drift_is_the_mean_of_the_output_for_a_probe_of_one_half(scale: int, height: int, width: int) -> None:
+def test_drift_is_the_mean_of_the_output_for_a_probe_of_one_half(scale, height, width):
     net, (rgb, disparity) = _net(scale), _scene(scale, height, width, batch=2)
     guidance, probe = guidance_map(rgb, net.variant), normalise(disparity).values
     with torch.inference_mode():
@@ -116,41 +98,25 @@ def test_drift_is_the_mean_of_the_output_for_a_probe_of_one_half(scale: int, hei
     rows, columns = (slice(n // 16, n // 4 - n // 16) for n in (height, width))
     expected = output[..., rows, columns].mean((-2, -1), keepdim=True).double()
     torch.testing.assert_close(drift, expected, rtol=0, atol=1e-6)
-
-
-def test_drift_is_0_where_its_region_is_empty() -> None:
-    net, (rgb, disparity) = _net(4), _scene(4, 3, 40)
-    assert net.drift(guidance_map(rgb, net.variant), normalise(disparity).values).tolist() == [[[[0.0]]]]
+    assert net.drift(guidance[..., : 2 * scale, :], probe[..., :2, :]).count_nonzero() == 0  # of no rows
 
 
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("rows", [1, 4, 7])
-def test_receptive_field_bounds_the_input_rows_that_matter(scale: int, rows: int) -> None:
+def test_receptive_field_bounds_the_input_rows_that_matter(scale, rows):
     net = _net(scale).double()
     seen = net.rows_seen(rows)
     height = seen + 6
     guidance = torch.rand(1, 1, scale * height, scale, dtype=torch.float64, requires_grad=True)
     depth = torch.rand(1, 1, height, 1, dtype=torch.float64, requires_grad=True)
     net(guidance, depth)[..., :rows, :].square().sum().backward()
-    assert guidance.grad is not None
-    assert depth.grad is not None
     used = [int(grad.abs().sum((0, 1, 3)).nonzero().max()) + 1 for grad in (guidance.grad, depth.grad)]
     assert used[0] <= scale * seen
     assert used[1] == seen
 
 
-@pytest.mark.parametrize("variant", get_args(VariantName))
-def test_channels_last_and_inference_mode_change_nothing(variant: VariantName) -> None:
-    net, (rgb, disparity) = _net(4, variant), _scene(4, 24, 31)
-    with torch.no_grad():
-        plain = net.upsample(rgb, disparity)
-    fast = copy.deepcopy(net).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    with torch.inference_mode():
-        torch.testing.assert_close(fast.upsample(rgb, disparity), plain, rtol=0, atol=1e-5 * 5)
-
-
 @pytest.mark.parametrize("variant", ["hui", "voynov"])
-def test_bfloat16_stays_within_a_thousandth_of_the_range(variant: VariantName) -> None:
+def test_bfloat16_stays_within_a_thousandth_of_the_range(variant):
     sample, net = _sample(4, 32, 40), _net(4, variant)
     exact = to_range(NetworkUpsampler(net)(sample), sample.camera, "disparity")
     rounded = to_range(NetworkUpsampler(net, "bfloat16")(sample), sample.camera, "disparity")
@@ -160,7 +126,7 @@ def test_bfloat16_stays_within_a_thousandth_of_the_range(variant: VariantName) -
 
 
 @pytest.mark.parametrize("doffs", [0.0, 30.0])
-def test_plane_keeps_its_depth_with_and_without_a_disparity_offset(doffs: float) -> None:
+def test_plane_keeps_its_depth_with_and_without_a_disparity_offset(doffs):
     sample = _sample(4, 8, 8, doffs)
     flat = DepthSample("test", "flat", sample.rgb, torch.full((1, 8, 8), 2.5), sample.camera, sample.camera_lr, 4)
     depth = NetworkUpsampler(_net(4))(flat)
@@ -168,7 +134,7 @@ def test_plane_keeps_its_depth_with_and_without_a_disparity_offset(doffs: float)
     torch.testing.assert_close(depth, torch.full_like(depth, 2.5))
 
 
-def test_hui_method_leaves_its_last_row_and_column_missing() -> None:
+def test_hui_method_leaves_its_last_row_and_column_missing():
     depth = NetworkUpsampler(_net(4, "hui"))(_sample(4, 8, 9))
     assert depth.shape == (1, 32, 36)
     assert bool(depth[0, -1].isnan().all())
@@ -176,31 +142,29 @@ def test_hui_method_leaves_its_last_row_and_column_missing() -> None:
     assert bool(depth[0, :-1, :-1].isfinite().all())
 
 
-def test_disparity_that_is_not_positive_becomes_a_hole() -> None:
+def test_disparity_that_is_not_positive_becomes_a_hole():
     net = _net(4, "hui")
     torch.nn.init.constant_(net.get_parameter("reconstruct.conv.bias"), -100.0)
     assert bool(NetworkUpsampler(net)(_sample(4, 8, 8)).isnan().all())
 
 
-def test_weights_that_do_not_fit_are_refused_and_change_nothing() -> None:
-    net, first = MSGNet(4), MSGNet(8)
+def test_weights_that_do_not_fit_are_refused_and_change_nothing():
+    net = MSGNet(4)
     before = {name: value.clone() for name, value in net.state_dict().items()}
-    with pytest.raises(
-        ValueError, match=r"^weights are for scale 8, the run is at scale 4, where MSGNet has other parameters$"
-    ):
-        net.start_from(first)
+    with pytest.raises(ValueError, match="weights are for scale 8, the run is at scale 4"):
+        net.start_from(MSGNet(8))
     assert all(torch.equal(value, before[name]) for name, value in net.state_dict().items())
 
 
-def test_other_scale_and_unknown_precision_are_refused() -> None:
+def test_other_scale_and_unknown_precision_are_refused():
     with pytest.raises(ValueError, match="scene: expected scale 4, the network's, got 2"):
         NetworkUpsampler(_net(4))(_sample(2, 8, 8))
-    with pytest.raises(ValueError, match="precision: expected one of float32, bfloat16, got 'float16'"):
-        NetworkUpsampler(_net(4), "float16")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="precision: expected"):
+        NetworkUpsampler(_net(4), "float16")
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_prelu_gradients_equal_those_of_torch(dtype: torch.dtype) -> None:
+def test_prelu_gradients_equal_those_of_torch(dtype):
     net = MSGNet(4, "dsr")
     layer = net.smooth.to(dtype)
     x = torch.randn(2, 32, 9, 8, generator=torch.Generator().manual_seed(0)).to(dtype).requires_grad_()
@@ -215,7 +179,7 @@ def test_prelu_gradients_equal_those_of_torch(dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8])
-def test_untrained_variant_of_ours_is_nearly_the_interpolation_without_a_checkerboard(scale: int) -> None:
+def test_untrained_variant_of_ours_is_nearly_the_interpolation_without_a_checkerboard(scale):
     torch.manual_seed(0)
     rgb, disparity = torch.rand(1, 3, 8 * scale, 9 * scale), torch.rand(1, 1, 8, 9, dtype=torch.float64)
     with torch.no_grad():

@@ -1,34 +1,45 @@
-"""What holds of every network of ours that works on the disparity's range, whatever its weights are."""
-
-from collections.abc import Callable
-from types import MappingProxyType
+"""What holds of every network on the disparity's range, whatever its weights; its tiles and augmentations."""
 
 import pytest
 import torch
-from small_scenes import maps, photos
+from small_scenes import maps, photos, plane_map
+from torch.nn import functional
 
+from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.images import compute_min_max
 from dsr.methods.networks.ddrnet import DDRNet
 from dsr.methods.networks.dynamic_guidance import DynamicGuidance
 from dsr.methods.networks.facets import Facets
-from dsr.methods.networks.network import DisparityNetwork, NetworkUpsampler
+from dsr.methods.networks.msg_net import MSGNet
+from dsr.methods.networks.network import (
+    ENSEMBLES,
+    DisparityNetwork,
+    NetworkUpsampler,
+    apply_dihedral,
+    blend_tiles,
+    split_axis,
+    undo_dihedral,
+)
 from dsr.methods.networks.pdn import PrimalDualNetwork
 from dsr.methods.networks.sparse_to_dense import SparseToDense
+from dsr.sample import DepthSample
 
-WINDOWED: MappingProxyType[str, Callable[[int], DisparityNetwork]] = MappingProxyType(
-    {
-        "facets": lambda scale: Facets(scale, width=8, blocks=1),
-        "pdn": lambda scale: PrimalDualNetwork(scale, width=6, layers=2, window=3, iterations=1),
-        "dg": lambda scale: DynamicGuidance(scale, stages=1, filters=4, size=3),
-        "ddrnet": lambda scale: DDRNet(scale, denoising=4, refinement=4),
-    }
-)
-BUILDERS: MappingProxyType[str, Callable[[int], DisparityNetwork]] = MappingProxyType(
-    {**WINDOWED, "sparse_to_dense": lambda scale: SparseToDense(scale, width=4)}
-)
+BUILDERS = {
+    "facets": lambda scale: Facets(scale, width=8, blocks=1),
+    "pdn": lambda scale: PrimalDualNetwork(scale, width=6, layers=2, window=3, iterations=1),
+    "dg": lambda scale: DynamicGuidance(scale, stages=1, filters=4, size=3),
+    "ddrnet": lambda scale: DDRNet(scale, denoising=4, refinement=4),
+    "sparse_to_dense": lambda scale: SparseToDense(scale, width=4),
+    "msg": lambda scale: MSGNet(scale, "dsr"),
+}
+WINDOWED = {
+    **{name: lambda name=name: BUILDERS[name](4) for name in ("facets", "pdn", "dg", "ddrnet", "msg")},
+    "voynov": lambda: MSGNet(4, "voynov"),
+    "hui": lambda: MSGNet(2, "hui"),
+}
 
 
-def _build(name: str, scale: int = 4) -> DisparityNetwork:
+def _build(name, scale=4):
     """Return a small network whose weights are far from those that it starts with."""
     net = BUILDERS[name](scale)
     torch.manual_seed(scale)
@@ -38,16 +49,16 @@ def _build(name: str, scale: int = 4) -> DisparityNetwork:
 
 
 @pytest.fixture(params=BUILDERS)
-def net(request: pytest.FixtureRequest) -> DisparityNetwork:
+def net(request):
     return _build(request.param)
 
 
-def test_networks_are_equivariant_to_scale_and_offset_of_disparity(net: DisparityNetwork) -> None:
+def test_networks_are_equivariant_to_scale_and_offset_of_disparity(net):
     rgb, coarse = photos(24, 28), maps(6, 7)
     torch.testing.assert_close(net.upsample(rgb, 3 * coarse + 7), 3 * net.upsample(rgb, coarse) + 7, rtol=1e-6, atol=0)
 
 
-def test_given_min_max_normalises_a_window_like_its_image(net: DisparityNetwork) -> None:
+def test_given_min_max_normalises_a_window_like_its_image(net):
     rgb, coarse = photos(24, 28), maps(6, 7)
     own = torch.tensor([coarse.min(), coarse.max()]).view(1, 2, 1, 1)
     torch.testing.assert_close(net.upsample(rgb, coarse, own), net.upsample(rgb, coarse), rtol=1e-6, atol=0)
@@ -55,18 +66,28 @@ def test_given_min_max_normalises_a_window_like_its_image(net: DisparityNetwork)
     assert not torch.allclose(net.upsample(rgb, coarse, wide), net.upsample(rgb, coarse), rtol=1e-5)
 
 
-def test_constant_map_stays_constant(net: DisparityNetwork) -> None:
+def test_constant_map_stays_constant(net):
     result = net.upsample(photos(24, 28), torch.full((1, 1, 6, 7), 5.0))
     torch.testing.assert_close(result, torch.full((1, 1, 24, 28), 5.0), rtol=1e-6, atol=0)
 
 
-def test_photo_influences_the_result(net: DisparityNetwork) -> None:
+@pytest.mark.parametrize("scale", [2, 4, 8, 16])
+@pytest.mark.parametrize("name", ["facets", "dg"])
+def test_plane_is_reproduced_for_any_weights_and_photo(name, scale):
+    fine = plane_map(6 * scale, 7 * scale)
+    rgb, coarse = photos(6 * scale, 7 * scale), functional.avg_pool2d(fine, scale)
+    for dtype, share in ((torch.float64, 1e-12), (torch.float32, 1e-5), (torch.bfloat16, 1e-4)):
+        result = _build(name, scale).to(dtype).upsample(rgb, coarse)
+        torch.testing.assert_close(result, fine, rtol=0, atol=share * 30 * scale if name == "dg" else 1e-11)
+
+
+def test_photo_influences_the_result(net):
     coarse = maps(6, 7)
     one, other = (net.upsample(photo, coarse) for photo in (photos(24, 28), 1 - photos(24, 28).square()))
     assert not torch.allclose(one, other, rtol=1e-4)
 
 
-def test_batch_equals_single_images_every_time(net: DisparityNetwork) -> None:
+def test_batch_equals_single_images_every_time(net):
     rgb, coarse = photos(24, 28, 3), maps(6, 7, 3)
     together = net.upsample(rgb, coarse)
     alone = torch.cat([net.upsample(rgb[i : i + 1], coarse[i : i + 1]) for i in range(3)])
@@ -74,7 +95,7 @@ def test_batch_equals_single_images_every_time(net: DisparityNetwork) -> None:
     assert torch.equal(net.upsample(rgb, coarse), together)
 
 
-def test_maps_of_any_size_keep_their_dtype(net: DisparityNetwork) -> None:
+def test_maps_of_any_size_keep_their_dtype(net):
     for height, width in ((1, 1), (1, 5), (2, 2), (3, 7)):
         for dtype in (torch.float32, torch.float64):
             result = net.upsample(photos(4 * height, 4 * width), maps(height, width).to(dtype))
@@ -83,43 +104,11 @@ def test_maps_of_any_size_keep_their_dtype(net: DisparityNetwork) -> None:
             assert bool(result.isfinite().all())
 
 
-@pytest.mark.parametrize("name", WINDOWED)
-def test_hole_is_filled_locally_within_the_receptive_field(name: str) -> None:
-    net = _build(name)
-    assert net.receptive_field_radius is not None
-    columns = 2 * net.receptive_field_radius + 6
-    rgb, coarse = photos(32, 4 * columns), maps(8, columns)
-    coarse[..., 0, 0], coarse[..., 0, 1] = 20, 29  # the range, which normalises
-    pierced = coarse.clone()
-    pierced[..., 3, 2] = torch.nan
-    result, whole = net.upsample(rgb, pierced), net.upsample(rgb, coarse)
-    assert bool(result.isfinite().all())
-    far = 4 * (2 + net.receptive_field_radius + 2)
-    torch.testing.assert_close(result[..., far:], whole[..., far:], rtol=1e-6, atol=0)
-    assert not torch.allclose(result[..., 12:16, 8:12], whole[..., 12:16, 8:12])
-
-
-def test_image_without_a_valid_pixel_becomes_nan(net: DisparityNetwork) -> None:
+def test_image_without_a_valid_pixel_becomes_nan(net):
     assert bool(net.upsample(photos(24, 28), torch.full((1, 1, 6, 7), torch.nan)).isnan().all())
 
 
-@pytest.mark.parametrize("scale", [2, 4])
-@pytest.mark.parametrize("name", WINDOWED)
-def test_tiles_equal_the_whole_image(name: str, scale: int) -> None:
-    net = _build(name, scale)
-    assert net.receptive_field_radius is not None
-    rows, columns = net.receptive_field_radius + 9, 2 * net.receptive_field_radius + 10
-    rgb, coarse = photos(scale * rows, scale * columns).double(), maps(rows, columns).double()
-    tiled, whole = NetworkUpsampler(net, tile=4 * scale), NetworkUpsampler(net)
-    for method in (tiled, whole):
-        method.net.double()  # in float32 the rounding depends on the processor
-    atol = 2e-5 if isinstance(net, PrimalDualNetwork) else 1e-10  # PDN's inputs are always float32
-    torch.testing.assert_close(
-        tiled.upsample_disparity(rgb, coarse), whole.upsample_disparity(rgb, coarse), rtol=0, atol=atol
-    )
-
-
-def test_patches_get_the_answer_of_the_upsampling_prepared_or_not(net: DisparityNetwork) -> None:
+def test_patches_get_the_answer_of_the_upsampling_prepared_or_not(net):
     rgb, coarse = photos(24, 28, 2), maps(6, 7, 2).float()
     coarse[0, :, 2:4, 3] = torch.nan
     batch = {"rgb": rgb, "disparity_lr": coarse, "min_max": compute_min_max(coarse)}
@@ -127,7 +116,7 @@ def test_patches_get_the_answer_of_the_upsampling_prepared_or_not(net: Disparity
         assert torch.equal(net.answer_patches(each).disparity, net.upsample(rgb, coarse))
 
 
-def test_training_reaches_every_parameter(net: DisparityNetwork) -> None:
+def test_training_reaches_every_parameter(net):
     net.train().requires_grad_()
     coarse = maps(16, 16, 2).float()
     coarse[..., 8:] += 20  # a depth discontinuity, across which weights count
@@ -139,13 +128,149 @@ def test_training_reaches_every_parameter(net: DisparityNetwork) -> None:
         assert bool(parameter.grad.any()), name
 
 
-def test_photo_of_another_size_is_refused(net: DisparityNetwork) -> None:
-    with pytest.raises(ValueError, match=r"^rgb: expected \(24, 28\) pixels for a map of \(6, 7\) at scale 4"):
+def test_photo_of_another_size_is_refused(net):
+    with pytest.raises(ValueError, match=r"^rgb: expected"):
         net.upsample(photos(24, 24), maps(6, 7))
 
 
-def test_network_is_rebuilt_from_its_arguments(net: DisparityNetwork) -> None:
+def test_network_is_rebuilt_from_its_arguments(net):
     again = type(net)(**net.arguments()).eval()
     again.load_state_dict(net.state_dict())
     rgb, coarse = photos(16, 12), maps(4, 3)
     assert torch.equal(again.upsample(rgb, coarse), net.upsample(rgb, coarse))
+
+
+class _Leaning(DisparityNetwork):
+    """Repeats the low-resolution pixels and adds a ramp to the right and an arc from top to bottom."""
+
+    scale = 2
+
+    def arguments(self):
+        return {}
+
+    def upsample(self, rgb, disparity, min_max=None):
+        ramp = torch.linspace(-1, 1, rgb.shape[-1], dtype=disparity.dtype)
+        arc = torch.linspace(-1, 1, rgb.shape[-2], dtype=disparity.dtype)[:, None] ** 2
+        return functional.interpolate(disparity, scale_factor=2, mode="nearest") + ramp + arc
+
+
+def _method(name, *, ensemble=1):
+    """Return a network whose answer is far from smooth, so that whatever a window misses shows."""
+    torch.manual_seed(0)
+    net = WINDOWED[name]()
+    with torch.no_grad():
+        for parameter in net.parameters():
+            if parameter.dim() > 1:
+                parameter.mul_(1.5)
+    return NetworkUpsampler(net.double(), ensemble=ensemble)
+
+
+def _pair(scale, height, width):
+    generator = torch.Generator().manual_seed(3)
+    rgb = torch.rand((1, 3, scale * height, scale * width), generator=generator)
+    coarse = 20 + 5 * torch.rand((1, 1, height, width), generator=generator)
+    return rgb, coarse
+
+
+def _sample(scale, height, width):
+    rgb, coarse = _pair(scale, height, width)
+    camera = Camera(scale * width, scale * height, 600.0, 600.0, 3.0, 4.0, baseline=0.2)
+    low = camera.rescale(width, height)
+    depth = from_range(coarse[0].double() / scale, low, "disparity")
+    return DepthSample("test", "scene", rgb[0], depth, camera, low, scale)
+
+
+@pytest.mark.parametrize(("size", "tile", "overlap"), [(100, 30, 4), (31, 30, 4), (30, 30, 4), (7, 1, 2), (1, 5, 0)])
+def test_tile_weights_add_up_to_one_everywhere(size, tile, overlap):
+    total = torch.zeros(2 * size)
+    for span in split_axis(size, tile, 3, overlap):
+        assert span.read.start <= span.kept.start < span.kept.stop <= span.read.stop
+        assert span.kept.stop - span.kept.start <= max(tile, overlap + 1) + overlap
+        total[2 * span.kept.start : 2 * span.kept.stop] += span.weights(2)
+    torch.testing.assert_close(total, torch.ones(2 * size))
+
+
+def test_window_covers_the_receptive_field_within_the_image():
+    first, second, last = split_axis(90, 30, 7, 4)
+    assert (first.read, second.read, last.read) == (slice(0, 39), slice(21, 69), slice(51, 90))
+    assert (first.ramps, second.ramps, last.ramps) == ((0, 4), (4, 4), (4, 0))
+
+
+def test_results_that_differ_by_a_constant_are_joined_by_a_ramp():
+    values = iter((1.0, 2.0))
+    rows, columns = split_axis(4, 4, 0, 0), split_axis(20, 10, 0, 4)
+    line = blend_tiles(lambda r, c: torch.full((1, 1, 4, c.stop - c.start), next(values)), rows, columns, 1)[0, 0, 0]
+    expected = torch.cat((torch.ones(8), torch.tensor([1.125, 1.375, 1.625, 1.875]), torch.full((8,), 2.0)))
+    torch.testing.assert_close(line, expected)
+
+
+@pytest.mark.parametrize(("name", "ensemble"), [*((name, 1) for name in WINDOWED), ("facets", 8)])
+def test_tiled_result_equals_the_whole_image(name, ensemble):
+    method, steps = _method(name, ensemble=ensemble), []
+    scale = method.net.scale
+    rgb, coarse = _pair(scale, 14, 48)
+    coarse[..., 3:9, 4:20] = torch.nan  # a hole that is larger than a tile
+    if method.net.arguments().get("variant") in ("voynov", "hui"):
+        coarse = coarse.nan_to_num(nan=20.5)  # random networks turn the step at a hole into anything
+    with torch.inference_mode():
+        whole = method.upsample_disparity(rgb, coarse)
+        method.tile = 12 * scale
+        tiled = method.upsample_disparity(rgb, coarse, lambda done, total: steps.append((done, total)))
+    assert tiled.shape == whole.shape
+    count = 8 * ensemble
+    assert method.count_steps(*rgb.shape[-2:]) == count
+    assert steps == [(i + 1, count) for i in range(count)]
+    assert float((tiled - whole).abs().max() / (whole.max() - whole.min())) < 1e-5
+
+
+@pytest.mark.parametrize("name", WINDOWED)
+def test_pixels_beyond_the_receptive_field_do_not_matter(name):
+    net = _method(name).net
+    size, at = 2 * net.receptive_field_radius + 9, net.receptive_field_radius + 4
+    rgb, coarse = _pair(net.scale, size, size)
+    coarse[..., at, at], rgb[..., net.scale * at + 1, net.scale * at + 1] = 22.0, 0.5
+    other, photo = coarse.clone(), rgb.clone()
+    other[..., at, at], photo[..., net.scale * at + 1, net.scale * at + 1] = 23.0, 0.6
+    with torch.inference_mode():
+        context = net.context(rgb, coarse)
+        change = (net.upsample(photo, other, *context) - net.upsample(rgb, coarse, *context)).abs()[0, 0]
+    rows, columns = (change > 1e-6).nonzero().T
+    for index in (rows, columns):
+        distance = (index // net.scale - at).abs()
+        assert 0 < int(distance.max()) <= net.receptive_field_radius
+
+
+def test_large_photo_is_tiled_automatically(monkeypatch):
+    method, sample, parts = _method("facets"), _sample(4, 12, 12), []
+    whole = method(sample, lambda done, total: parts.append(total))
+    monkeypatch.setattr("dsr.methods.networks.network.UNTILED", 1000)
+    monkeypatch.setattr("dsr.methods.networks.network.TILE", 24)
+    tiled = method(sample, lambda done, total: parts.append(total))
+    assert parts == [1, *[4] * 4]
+    torch.testing.assert_close(tiled, whole, rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("index", range(8))
+def test_dihedral_transforms_are_distinct_and_invertible(index):
+    x = torch.rand(2, 3, 5, 5)
+    turned = apply_dihedral(x, index)
+    assert torch.equal(undo_dihedral(turned, index), x)
+    assert not any(torch.equal(turned, apply_dihedral(x, other)) for other in range(8) if other != index)
+
+
+def test_augmentation_averages_what_depends_on_the_orientation():
+    sample = _sample(2, 6, 8)
+    plain = functional.interpolate(sample.disparity_lr()[None], scale_factor=2, mode="nearest")[0]
+    down, right = (torch.linspace(-1, 1, n, dtype=torch.float64) for n in plain.shape[-2:])
+    leaning = plain + right + down[:, None] ** 2
+    even = plain + (right**2 + down[:, None] ** 2) / 2  # the ramps cancel out, the arcs turn
+    for ensemble, expected in zip(ENSEMBLES, (leaning, even, even), strict=True):
+        depth = NetworkUpsampler(_Leaning(), ensemble=ensemble)(sample)
+        torch.testing.assert_close(to_range(depth, sample.camera, "disparity"), expected)
+
+
+def test_invalid_augmentation_is_refused():
+    with pytest.raises(ValueError, match="ensemble: expected one of 1, 4, 8, got 2"):
+        NetworkUpsampler(MSGNet(2, "dsr"), ensemble=2)
+    with pytest.raises(ValueError, match="ensemble: expected"):
+        NetworkUpsampler(MSGNet(2, "hui"), ensemble=4)

@@ -5,41 +5,33 @@ The noise of cameras drawn at random has the stated amplitudes, lengths, steps, 
 
 import math
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
-from torch import Tensor
+from small_scenes import seeded
 
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
-from dsr.degradation.noise import NOISES, GaussianMultiplicative, Kinect, Noise, TimeOfFlight
-from dsr.degradation.random_degradation import Everything
+from dsr.degradation.noise import NOISES, GaussianMultiplicative, Kinect, TimeOfFlight
 from dsr.degradation.random_fields import field_of, waves_of
-from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType, from_range, to_range
+from dsr.geometry.camera import RANGE_TYPES, Camera, from_range, to_range
 from dsr.sample import Scene
-from dsr.utils.configuration import build
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 CAMERA = Camera(8, 4, 10.0, 10.0, 3.5, 1.5, baseline=0.1, doffs=0.5)
 STEPS = torch.arange(32, dtype=torch.float64).view(1, 4, 8) / 16 + 1
-KINDS: tuple[Noise, ...] = (GaussianMultiplicative(0.02), TimeOfFlight(), Kinect())
+KINDS = (GaussianMultiplicative(0.02), TimeOfFlight(), Kinect())
 SENSORS = KINDS[1:]
-QUIET: dict[str, Any] = {"std": 0.0, "dropout": 0.0}
+QUIET = {"std": 0.0, "dropout": 0.0}
 BOX = Downsampling("box")
 
 
-def _generator(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
-def _wall(depth: float, size: int = 400) -> Tensor:
+def _wall(depth, size=400):
     return torch.full((1, size, size), depth, dtype=torch.float64)
 
 
-def _scene(depth: Tensor | None = STEPS, measured: dict[int, Tensor] | None = None) -> Scene:
+def _scene(depth=STEPS, measured=None):
     return Scene("set", "hall", torch.zeros(3, 4, 8), CAMERA, depth, measured or {})
 
 
@@ -47,55 +39,44 @@ def _scene(depth: Tensor | None = STEPS, measured: dict[int, Tensor] | None = No
 
 
 @pytest.mark.parametrize("noise", KINDS)
-def test_generator_reproduces_the_noise_and_another_one_differs(noise: Noise) -> None:
-    depth = _wall(2.0, 20)
-    first, again, other = (noise(depth, _generator(seed)) for seed in (1, 1, 2))
-    assert torch.equal(first, again)
-    assert not torch.equal(first, other)
-
-
-@pytest.mark.parametrize("noise", KINDS)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_noise_keeps_holes_shape_and_dtype(noise: Noise, dtype: torch.dtype) -> None:
-    depth = torch.full((2, 1, 5, 7), 2.0, dtype=dtype)
+def test_noise_is_a_function_of_its_generator_keeps_holes_and_is_the_same_in_float32(noise):
+    depth = 1 + torch.rand(2, 1, 30, 40, generator=seeded(3))
     depth[1, 0, 2, 3] = torch.nan
-    noisy = noise(depth, _generator())
-    assert (noisy.shape, noisy.dtype) == (depth.shape, dtype)
-    assert torch.equal(noisy.isnan(), depth.isnan())
-
-
-@pytest.mark.parametrize("noise", KINDS)
-def test_float32_noise_equals_float64_noise(noise: Noise) -> None:
-    depth = (1 + torch.rand(1, 30, 40, generator=_generator(3))).float()
-    single, double = noise(depth, _generator()), noise(depth.double(), _generator())
+    single, again, other = (noise(depth, seeded(seed)) for seed in (1, 1, 2))
+    assert (single.shape, single.dtype) == (depth.shape, torch.float32)
+    assert torch.equal(single.nan_to_num(), again.nan_to_num())
+    assert not torch.equal(single.nan_to_num(), other.nan_to_num())
+    double = noise(depth.double(), seeded(1))
     torch.testing.assert_close(single.double(), double, rtol=1e-6, atol=0, equal_nan=True)
+    if not isinstance(noise, Kinect):  # whose pixels may be lost
+        assert torch.equal(double.isnan(), depth.isnan())
 
 
 @pytest.mark.parametrize("method", RANGE_TYPES)
 @pytest.mark.parametrize("noise", SENSORS)
-def test_sensor_noise_applies_to_metric_depth_whatever_is_averaged(noise: Noise, method: RangeType) -> None:
+def test_sensor_noise_applies_to_metric_depth_whatever_is_averaged(noise, method):
     clean = make_sample(_scene(), 2, BOX, method).depth_lr
-    noisy = make_sample(_scene(), 2, BOX, method, noise, _generator(5)).depth_lr
-    torch.testing.assert_close(noisy, noise(clean, _generator(5)), rtol=1e-12, atol=0, equal_nan=True)
+    noisy = make_sample(_scene(), 2, BOX, method, noise, seeded(5)).depth_lr
+    torch.testing.assert_close(noisy, noise(clean, seeded(5)), rtol=1e-12, atol=0, equal_nan=True)
 
 
 @pytest.mark.parametrize("method", RANGE_TYPES)
-def test_noise_gets_its_declared_range_type(method: RangeType) -> None:
+def test_noise_gets_its_declared_range_type(method):
     class Offset:
         range_type = "perspective"
 
-        def __call__(self, values: Tensor, generator: torch.Generator) -> Tensor:
+        def __call__(self, values, generator):
             return values + 1
 
-    clean, noisy = (make_sample(_scene(), 2, BOX, method, noise) for noise in (None, Offset()))  # type: ignore[arg-type]
+    clean, noisy = (make_sample(_scene(), 2, BOX, method, noise) for noise in (None, Offset()))
     camera = clean.camera_lr
     expected = from_range(to_range(clean.depth_lr, camera, "perspective") + 1, camera, "perspective")
     torch.testing.assert_close(noisy.depth_lr, expected, rtol=1e-13, atol=0)
 
 
 @pytest.mark.parametrize("noise", KINDS)
-def test_refused_or_measured_sample_draws_nothing(noise: Noise) -> None:
-    generator = _generator(4)
+def test_refused_or_measured_sample_draws_nothing(noise):
+    generator = seeded(4)
     before = generator.get_state()
     measured = _scene(None, {2: BOX(STEPS, 2)})
     assert torch.equal(make_sample(measured, 2, Measured(), "disparity", noise, generator).depth_lr, BOX(STEPS, 2))
@@ -105,62 +86,37 @@ def test_refused_or_measured_sample_draws_nothing(noise: Noise) -> None:
     assert torch.equal(generator.get_state(), before)
 
 
-def test_sensor_draws_the_same_numbers_for_all_settings() -> None:
+def test_sensor_draws_the_same_numbers_for_all_settings():
     states = []
     for noise in (Kinect(), Kinect(**QUIET, nearest=None, farthest=None), Kinect(reach=3, dropout=1.0)):
-        generator = _generator(2)
+        generator = seeded(2)
         noise(STEPS, generator)
         states.append(generator.get_state())
     assert all(torch.equal(state, states[0]) for state in states)
 
 
-@pytest.mark.parametrize(("name", "expected"), [("tof", TimeOfFlight()), ("kinect", Kinect())])
-def test_configuration_files_hold_the_defaults(name: str, expected: Noise) -> None:
-    node = OmegaConf.to_container(OmegaConf.load(REPOSITORY / "conf" / "noise" / f"{name}.yaml"))
-    assert isinstance(node, dict)
-    assert build("noise", node) == expected  # type: ignore[arg-type]
-    assert set(node) == {"_target_", *vars(expected)}
-
-
-@pytest.mark.parametrize(
-    ("kind", "key", "value"),
-    [
-        (GaussianMultiplicative, "std", 1.0), (TimeOfFlight, "strength", 0.0), (TimeOfFlight, "strength", math.nan),
-        (TimeOfFlight, "stereo_constant", -1.0), (TimeOfFlight, "doffs", -1.0), (TimeOfFlight, "doffs", math.inf),
-        (Kinect, "std", -0.1), (Kinect, "std", math.nan), (Kinect, "step", 0.0), (Kinect, "stereo_constant", math.inf),
-        (Kinect, "dropout", 1.1), (Kinect, "jump", 0.0), (Kinect, "reach", 0), (Kinect, "reach", 1.5),
-        (Kinect, "nearest", 0.0), (Kinect, "farthest", -8.0), (Kinect, "farthest", 0.3),
-    ],
-)  # fmt: skip
-def test_invalid_value_is_refused_by_its_key(kind: Any, key: str, value: float) -> None:
-    with pytest.raises(ValueError, match=f"^{key}: expected .*, got {value}$"):
-        kind(**{key: value})
-
-
 # Time of flight
 
 
-def test_disparity_noise_of_time_of_flight_is_normal_with_the_given_deviation() -> None:
-    depth = 1 + 2 * torch.rand(1, 40, 50, generator=_generator(1), dtype=torch.float64)
+def test_disparity_noise_of_time_of_flight_is_normal_with_the_given_deviation():
+    depth = 1 + 2 * torch.rand(1, 40, 50, generator=seeded(1), dtype=torch.float64)
     noise = TimeOfFlight(strength=300.0, stereo_constant=500.0, doffs=20.0)
     clean = 500 / depth - 20
-    draws = torch.randn(depth.shape, generator=_generator(), dtype=torch.float64)
-    torch.testing.assert_close(500 / noise(depth, _generator()) - 20, clean + 300 / clean * draws, rtol=1e-12, atol=0)
+    draws = torch.randn(depth.shape, generator=seeded(), dtype=torch.float64)
+    torch.testing.assert_close(500 / noise(depth, seeded()) - 20, clean + 300 / clean * draws, rtol=1e-12, atol=0)
 
 
-def test_non_positive_disparity_of_time_of_flight_is_a_hole() -> None:
-    noisy = TimeOfFlight()(_wall(30.0, 100), _generator())
-    draws = torch.randn(1, 100, 100, generator=_generator(), dtype=torch.float64)
+def test_non_positive_disparity_of_time_of_flight_is_a_hole():
+    noisy = TimeOfFlight()(_wall(30.0, 100), seeded())
+    draws = torch.randn(1, 100, 100, generator=seeded(), dtype=torch.float64)
     v = 598.4 / 30
     assert torch.equal(noisy.isnan(), v + 651 / v * draws <= 0)
     assert bool((noisy[noisy.isfinite()] > 0).all())
-    assert bool(TimeOfFlight(doffs=200.0)(_wall(3.0, 10), _generator()).isnan().all())
+    assert bool(TimeOfFlight(doffs=200.0)(_wall(3.0, 10), seeded()).isnan().all())
 
 
 @pytest.mark.parametrize(("name", "scale"), [("art_depth_2_n.png", 4), ("art_depth_3_n.png", 8)])
-def test_noisy_middlebury_inputs_have_five_levels_of_noise_at_every_disparity(
-    shared: Path, name: str, scale: int
-) -> None:
+def test_noisy_middlebury_inputs_have_five_levels_of_noise_at_every_disparity(shared, name, scale):
     folder = shared / "real" / "middlebury2005"
     fine, noisy = (cv2.imread(str(folder / each), cv2.IMREAD_UNCHANGED).astype(float) for each in ("art_big.png", name))
     height, width = noisy.shape
@@ -177,31 +133,31 @@ def test_noisy_middlebury_inputs_have_five_levels_of_noise_at_every_disparity(
 
 
 @pytest.mark.parametrize("depth", [1.0, 2.0, 3.0, 5.0])
-def test_kinect_noise_is_that_of_khoshelham_and_grows_with_the_square_of_depth(depth: float) -> None:
+def test_kinect_noise_is_that_of_khoshelham_and_grows_with_the_square_of_depth(depth):
     span = 1 + 0.02 * torch.linspace(-1, 1, 400, dtype=torch.float64)  # several steps: one depth lies well or badly
     wall = _wall(depth) * span
-    errors = (Kinect()(wall, _generator()) - wall) / wall**2
+    errors = (Kinect()(wall, seeded()) - wall) / wall**2
     assert float(errors.std()) == pytest.approx(1.425e-3, rel=0.02)
     assert float(errors.mean()) == pytest.approx(0, abs=2e-5)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_kinect_disparity_comes_in_eighths_of_the_sensors_pixels(dtype: torch.dtype) -> None:
-    depth = 0.5 + 7 * torch.rand(1, 60, 80, generator=_generator(1), dtype=torch.float64).to(dtype)
-    reading = Kinect()(depth, _generator())
+def test_kinect_disparity_comes_in_eighths_of_the_sensors_pixels(dtype):
+    depth = 0.5 + 7 * torch.rand(1, 60, 80, generator=seeded(1), dtype=torch.float64).to(dtype)
+    reading = Kinect()(depth, seeded())
     eighths = (8 * 0.075 * 580 / reading[reading.isfinite()]).double()
     assert eighths.numel() > 1000
     torch.testing.assert_close(eighths, eighths.round(), rtol=0, atol=1e-9 if dtype == torch.float64 else 2e-4)
 
 
-def test_kinect_without_noise_reads_the_nearest_step() -> None:
+def test_kinect_without_noise_reads_the_nearest_step():
     noise = Kinect(**QUIET, step=0.5, stereo_constant=10.0, nearest=None, farthest=None)
     disparity = torch.tensor([[[9.8, 10.2, 10.3, 0.3, 0.2]]], dtype=torch.float64)
     expected = torch.tensor([[[1.0, 1.0, 10 / 10.5, 20.0, torch.nan]]], dtype=torch.float64)
-    torch.testing.assert_close(noise(10 / disparity, _generator()), expected, rtol=1e-12, atol=0, equal_nan=True)
+    torch.testing.assert_close(noise(10 / disparity, seeded()), expected, rtol=1e-12, atol=0, equal_nan=True)
 
 
-def _step() -> Tensor:
+def _step():
     """Return a wall at 3 m with a box at 2 m before it, in rows 10 to 19 and columns 15 to 24."""
     depth = _wall(3.0, 40)
     depth[0, 10:20, 15:25] = 2.0
@@ -209,8 +165,8 @@ def _step() -> Tensor:
 
 
 @pytest.mark.parametrize("reach", [1, 2, 4])
-def test_dropouts_lie_near_depth_edges_alone(reach: int) -> None:
-    lost = Kinect(dropout=1.0, reach=reach)(_step(), _generator()).isnan()
+def test_dropouts_lie_near_depth_edges_alone(reach):
+    lost = Kinect(dropout=1.0, reach=reach)(_step(), seeded()).isnan()
     inside = {(row, column) for row in range(10, 20) for column in range(15, 25)}
     outside = {(row, column) for row in range(40) for column in range(40)} - inside
     around = ((0, 1), (1, 0), (0, -1), (-1, 0))
@@ -226,66 +182,58 @@ def test_dropouts_lie_near_depth_edges_alone(reach: int) -> None:
     assert torch.equal(lost, expected)
 
 
-def test_dropouts_have_their_probability() -> None:
+def test_dropouts_have_their_probability_at_jumps_by_more_than_a_fraction_of_the_nearer_depth():
     depth = _wall(2.0, 300)
     depth[..., ::2] = 3.0
     for dropout in (0.2, 0.7):
-        assert float(Kinect(dropout=dropout)(depth, _generator()).isnan().double().mean()) == pytest.approx(
-            dropout, abs=0.01
-        )
+        lost = Kinect(dropout=dropout)(depth, seeded()).isnan().double().mean()
+        assert float(lost) == pytest.approx(dropout, abs=0.01)
+    for jump, expected in ((0.49, True), (0.51, False)):
+        assert bool(Kinect(dropout=1.0, jump=jump)(_step(), seeded()).isnan().any()) is expected
 
 
-@pytest.mark.parametrize(("jump", "expected"), [(0.49, True), (0.51, False)])
-def test_edge_is_a_jump_by_more_than_a_fraction_of_the_nearer_depth(jump: float, expected: bool) -> None:
-    assert bool(Kinect(dropout=1.0, jump=jump)(_step(), _generator()).isnan().any()) is expected
-
-
-def test_hole_makes_no_edge() -> None:
+def test_hole_makes_no_edge():
     depth = _wall(2.0, 20)
     depth[0, 5:9, 5:9] = torch.nan
-    assert torch.equal(Kinect(dropout=1.0)(depth, _generator()).isnan(), depth.isnan())
+    assert torch.equal(Kinect(dropout=1.0)(depth, seeded()).isnan(), depth.isnan())
 
 
-def test_readings_out_of_range_are_holes_unless_the_limits_are_off() -> None:
-    depth = torch.tensor([[[0.2, 0.39, 0.41, 2.0, 7.8, 8.3, 20.0]]], dtype=torch.float64)
-    quiet = Kinect(**QUIET)(depth, _generator())
-    assert quiet.isnan()[0, 0].tolist() == [True, True, False, False, False, True, True]
-    open_ended = Kinect(**QUIET, nearest=None, farthest=None)(depth, _generator())
-    torch.testing.assert_close(open_ended, depth, rtol=0.03, atol=0)
-
-
-def test_reading_without_disparity_or_behind_the_sensor_is_a_hole() -> None:
-    depth = torch.tensor([[[1e6, -1.0]]], dtype=torch.float64)
-    assert bool(Kinect(**QUIET, nearest=None, farthest=None)(depth, _generator()).isnan().all())
-    assert TimeOfFlight()(depth, _generator())[0, 0, 1].isnan()
+def test_readings_out_of_range_are_holes_unless_the_limits_are_off():
+    depth = torch.tensor([[[0.2, 0.39, 0.41, 2.0, 7.8, 8.3, 20.0, 1e6, -1.0]]], dtype=torch.float64)
+    quiet = Kinect(**QUIET)(depth, seeded())
+    assert quiet.isnan()[0, 0].tolist() == [True, True, False, False, False, *4 * [True]]
+    open_ended = Kinect(**QUIET, nearest=None, farthest=None)(depth, seeded())
+    torch.testing.assert_close(open_ended[..., :7], depth[..., :7], rtol=0.03, atol=0)
+    assert bool(open_ended[..., 7:].isnan().all())  # no disparity, and behind the sensor
+    assert bool(TimeOfFlight()(depth, seeded())[0, 0, 8].isnan())
 
 
 # Cameras drawn at random
 
 
-def _slanted(depth: float, size: int = 256) -> Tensor:
+def _slanted(depth, size=256):
     """Return inverse depth of a wall that turns away by 10 %."""
     return torch.linspace(1, 1.1, size).repeat(1, size, 1) / depth
 
 
-def _photo(like: Tensor) -> Tensor:
+def _photo(like):
     """Return a photo with texture everywhere."""
-    return torch.rand(like.shape, generator=_generator(1))
+    return torch.rand(like.shape, generator=seeded(1))
 
 
-def _square(size: int = 200) -> Tensor:
+def _square(size=200):
     """Return inverse depth of a square at 1 m, columns 80 to 119, before a wall at 2 m."""
     values = torch.full((1, size, size), 0.5)
     values[:, 60:140, 80:120] = 1
     return values
 
 
-def _errors(kind: str, values: Tensor, draws: int) -> list[Tensor]:
+def _errors(kind, values, draws):
     """Return relative errors of inverse depth."""
-    return [NOISES[kind](values, _photo(values), _generator(seed)) / values - 1 for seed in range(draws)]
+    return [NOISES[kind](values, _photo(values), seeded(seed)) / values - 1 for seed in range(draws)]
 
 
-def _full_width(field: Tensor) -> float:
+def _full_width(field):
     """Return the full width at half maximum of the autocorrelation of fields, (n, h, w), along rows and columns."""
     power, before = float(field.square().nanmean()), 1.0
     for lag in range(1, field.shape[-1] // 2):
@@ -298,42 +246,34 @@ def _full_width(field: Tensor) -> float:
 
 
 @pytest.mark.parametrize("length", [1, 3, 8, 20, 40])
-def test_waves_are_as_long_as_asked(length: float) -> None:
-    waves = torch.cat([waves_of(torch.empty(1, 256, 256), length, _generator(seed)) for seed in range(12)])
+def test_waves_are_as_long_as_asked(length):
+    waves = torch.cat([waves_of(torch.empty(1, 256, 256), length, seeded(seed)) for seed in range(12)])
     assert float(waves.std()) == pytest.approx(1, rel=0.1)
     assert _full_width(waves) == pytest.approx(length, rel=0.2)
-    stretched = torch.cat([waves_of(torch.empty(1, 256, 256), 8, _generator(seed), 1.5) for seed in range(4)])
+    stretched = torch.cat([waves_of(torch.empty(1, 256, 256), 8, seeded(seed), 1.5) for seed in range(4)])
     columns, rows = (float((each[0] * each[1]).mean()) for each in (
         (stretched[:, 4:], stretched[:, :-4]), (stretched[..., 4:], stretched[..., :-4])))  # fmt: skip
     assert rows > columns + 0.2
 
 
 @pytest.mark.parametrize("sigma", [1.0, 4.0, 12.0])
-def test_fields_are_alike_as_far_as_a_gaussian_makes_them(sigma: float) -> None:
-    field = torch.cat([field_of(torch.empty(1, 250, 250), sigma, _generator(seed)) for seed in range(12)])
+def test_fields_are_alike_as_far_as_a_gaussian_makes_them(sigma):
+    field = torch.cat([field_of(torch.empty(1, 250, 250), sigma, seeded(seed)) for seed in range(12)])
     lag = round(sigma)
     assert float(field.std()) == pytest.approx(1, rel=0.08)
     alike = float((field[..., lag:] * field[..., :-lag]).mean() / field.square().mean())
     assert alike == pytest.approx(math.exp(-((lag / sigma) ** 2) / 4), abs=0.06)
 
 
-def test_plain_waves_are_weak_and_lie_on_the_map() -> None:
-    for error in _errors("waves", _slanted(2), 12):
-        assert 0.001 < float(error.std()) < 0.012
-        assert 1.5 < _full_width(error - error.mean()) < 35
-    assert Everything().noises["waves"] == 0
-
-
-def test_stereo_loses_a_band_on_one_side() -> None:
+def test_stereo_loses_a_band_on_one_side():
     values = _square()
-    lost = sum(NOISES["stereo"](values, _photo(values), _generator(seed)).isnan() for seed in range(40))
-    assert isinstance(lost, Tensor)
+    lost = sum(NOISES["stereo"](values, _photo(values), seeded(seed)).isnan() for seed in range(40))
     left, right = (float(lost[0, 70:130, columns].float().mean()) for columns in (slice(70, 76), slice(124, 130)))
     assert left > 2.5 * right
     assert left > 8, "of 40"
 
 
-def test_stereo_repeats_values_has_waves_of_all_lengths_and_few_pixels_are_far_off() -> None:
+def test_stereo_repeats_values_has_waves_of_all_lengths_and_few_pixels_are_far_off():
     lengths, repeated = [], 0
     for error in _errors("stereo", _slanted(1.5, 320), 30):
         known = error.isfinite()
@@ -348,10 +288,10 @@ def test_stereo_repeats_values_has_waves_of_all_lengths_and_few_pixels_are_far_o
     assert 10 < repeated < 28
 
 
-def test_structured_light_is_as_noisy_as_measured_ones() -> None:
+def test_structured_light_is_as_noisy_as_measured_ones():
     """Nguyen et al. 2012: 1.2 mm + 1.9 mm (z - 0.4)^2, times 0.4 to 2.5, and steps of disparity."""
 
-    def deviation(depth: float) -> float:
+    def deviation(depth):
         errors = torch.stack([error[error.isfinite()].std() for error in _errors("structured", _slanted(depth), 80)])
         return depth * float(errors.median())
 
@@ -361,11 +301,11 @@ def test_structured_light_is_as_noisy_as_measured_ones() -> None:
     assert 4 < far / middle < 11
 
 
-def test_lidar_smears_steps_and_is_biased_by_distance() -> None:
+def test_lidar_smears_steps_and_is_biased_by_distance():
     """A seventh of a jump between neighbours at the softest; bias of up to 3 % near the sensor, less far away."""
     shares = []
     for seed in range(30):
-        values = NOISES["lidar"](_square(), _photo(_square()), _generator(seed))
+        values = NOISES["lidar"](_square(), _photo(_square()), seeded(seed))
         row = values[0, 70:130].median(dim=0).values
         shares.append([float((row[n:100] - row[: 100 - n]).max() / 0.5) for n in (1, 3)])
     one, three = torch.tensor(shares).T
@@ -377,22 +317,22 @@ def test_lidar_smears_steps_and_is_biased_by_distance() -> None:
     assert 2 < float(bias[0].max() / bias[1].max()) < 8
 
 
-def test_time_of_flight_mixes_depth_on_both_sides_of_steps() -> None:
+def test_time_of_flight_mixes_depth_on_both_sides_of_steps():
     sides = torch.zeros(2)
     for seed in range(30):
-        depth = NOISES["flight"](_square(), _photo(_square()), _generator(seed)).reciprocal()
+        depth = NOISES["flight"](_square(), _photo(_square()), seeded(seed)).reciprocal()
         between = ((depth > 1.05) & (depth < 1.95))[0, 70:130]
         sides += torch.stack((between[:, 76:80].float().mean(), between[:, 80:84].float().mean()))
     assert bool((sides > 2).all())
 
 
-def test_time_of_flight_sees_dark_surfaces_too_far_and_rounds_inner_corners() -> None:
+def test_time_of_flight_sees_dark_surfaces_too_far_and_rounds_inner_corners():
     depth = 2 - 0.004 * (torch.arange(200.0) - 100).abs().repeat(1, 200, 1)  # the farthest in the middle
     luma = torch.full(depth.shape, 0.7)
     luma[:, 100:] = 0.02
     dark, corner = [], []
     for seed in range(60):
-        error = NOISES["flight"](depth.reciprocal(), luma, _generator(seed)).reciprocal() - depth
+        error = NOISES["flight"](depth.reciprocal(), luma, seeded(seed)).reciprocal() - depth
         profile, bright = error.nanmean(dim=-2)[0], error[:, :100].nanmean(dim=-2)[0]
         dark.append(float(error[:, 100:].nanmean() - error[:, :100].nanmean()))
         corner.append(float(bright[98:103].mean() - (bright[60:75].mean() + bright[125:140].mean()) / 2))

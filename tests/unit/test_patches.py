@@ -6,25 +6,21 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from dsr.data.scene_source import SceneSource
-from dsr.degradation.downsampling import Downsampling, Measured, encode_facts, make_sample
+from dsr.degradation.downsampling import Downsampling, Measured, encode_facts
 from dsr.degradation.noise import GaussianMultiplicative, Kinect
 from dsr.degradation.random_degradation import Everything
 from dsr.geometry.camera import Camera
-from dsr.methods.images import normalise
 from dsr.sample import CENTIMETRES, Scene, Unit
 from dsr.training.data_module import Part, PatchData, WholeScenes
-from dsr.training.degradation import Batch, Degradation, to_tensors
+from dsr.training.degradation import Degradation
 from dsr.training.patches import Patches, augment, mirror, rotate90
 from dsr.training.settings import PatchSettings
 
@@ -36,33 +32,33 @@ NORMAL = torch.tensor([0.3, -0.4, -1.0], dtype=torch.float64)[:, None, None]
 SIZE = 16
 
 
-def _tilted(camera: Camera) -> Tensor:
+def _tilted(camera):
     return -2.0 / (NORMAL * camera.rays()).sum(dim=0, keepdim=True)
 
 
-def _scene(number: int = 0, camera: Camera = CAMERA, depth: Tensor | None = None) -> Scene:
+def _scene(number=0, camera=CAMERA, depth=None):
     """Return a scene whose photo says where each pixel lies: R the column, G the row, B the scene."""
     v, u = torch.meshgrid(torch.arange(float(camera.height)), torch.arange(float(camera.width)), indexing="ij")
     rgb = torch.stack((u / 255, v / 255, torch.full_like(u, number / 255)))
     return Scene("set", f"scene{number}", rgb, camera, _tilted(camera) if depth is None else depth)
 
 
-def _settings(**changes: Any) -> PatchSettings:
-    plain: dict[str, Any] = {"patch": SIZE, "batch": 2, "validation_scenes": 2}
+def _settings(**changes):
+    plain = {"patch": SIZE, "batch": 2, "validation_scenes": 2}
     return PatchSettings(**{**plain, "rotate": False, "depth_scale": 0.0, "colour": 0.0, "photo": 0.0, **changes})
 
 
-def _patches(scenes: list[Scene] | None = None, **changes: Any) -> Patches:
+def _patches(scenes=None, **changes):
     return Patches([scenes or [_scene()]], _settings(**changes), X4)
 
 
-def _places(patch: Batch) -> tuple[np.ndarray, np.ndarray, int]:
+def _places(patch):
     """Return the rows and columns of the scene that a patch shows, and the scene's number."""
     columns, rows, number = (patch["rgb"] * 255).round().int().numpy()
     return rows, columns, int(number[0, 0])
 
 
-def _same(first: Batch, second: Batch) -> bool:
+def _same(first, second):
     return all(torch.equal(first[name], second[name]) for name in first)
 
 
@@ -72,41 +68,39 @@ class _Source(SceneSource):
     name = "set"
     evaluation = False
 
-    def __init__(self, scenes: list[Scene]) -> None:
+    def __init__(self, scenes):
         self._scenes = {scene.name: scene for scene in scenes}
 
-    def scenes(self) -> list[str]:
+    def scenes(self):
         return list(self._scenes)
 
-    def load(self, scene: str) -> Scene:
+    def load(self, scene):
         return self._scenes[scene]
 
-    def fingerprint(self, scene: str) -> str:
+    def fingerprint(self, scene):
         return scene
 
 
-def _data(scenes: list[Scene] | None = None, degradation: Degradation = X4, **changes: Any) -> PatchData:
+def _data(scenes=None, degradation=X4, **changes):
     return PatchData(
         [Part(_Source(scenes or [_scene(i) for i in range(6)]))], _settings(**changes), degradation, seed=7
     )
 
 
-def _batches(
-    data: PatchData, count: int, step: int = 0, *, accumulate: int = 1, rank: int = 0, world: int = 1
-) -> list[Batch]:
+def _batches(data, count, step=0, *, accumulate=1, rank=0, world=1):
     """Return the first batches that a trainer at some step gets."""
-    data.trainer = SimpleNamespace(  # type: ignore[assignment]
+    data.trainer = SimpleNamespace(
         global_step=step, accumulate_grad_batches=accumulate, global_rank=rank, world_size=world, max_steps=8
     )
     data.setup()
     return list(itertools.islice(data.train_dataloader(), count))
 
 
-def _equal(first: list[Batch], second: list[Batch]) -> bool:
+def _equal(first, second):
     return len(first) == len(second) and all(map(_same, first, second))
 
 
-def test_patch_is_a_pure_function_of_the_seed_and_its_number() -> None:
+def test_patch_is_a_pure_function_of_the_seed_and_its_number():
     scenes, settings = [_scene(i) for i in range(3)], _settings(colour=0.1)
     whole, later = (Patches([scenes], settings, X4, seed=5) for _ in range(2))
     assert all(_same(later[i], whole[i]) for i in (9, 7, 8))  # whatever was asked for before
@@ -114,7 +108,7 @@ def test_patch_is_a_pure_function_of_the_seed_and_its_number() -> None:
     assert not _same(Patches([scenes], settings, X4, seed=6)[7], whole[7])
 
 
-def test_patches_neither_use_nor_change_the_global_random_states() -> None:
+def test_patches_neither_use_nor_change_the_global_random_states():
     patches = _patches(colour=0.1)
     torch.manual_seed(1)
     before, first = torch.get_rng_state(), patches[3]
@@ -124,13 +118,8 @@ def test_patches_neither_use_nor_change_the_global_random_states() -> None:
     assert _same(patches[3], first)
 
 
-def test_workers_cut_the_same_patches_as_the_trainer() -> None:
-    alone, helped = (_batches(_data(colour=0.1, workers=workers), 3, 1) for workers in (0, 2))
-    assert _equal(alone, helped)
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="needs signals")
-def test_workers_outlast_a_signal_to_the_whole_group_until_the_trainer_has_ended() -> None:
+def test_workers_outlast_a_signal_to_the_whole_group_until_the_trainer_has_ended():
     data, alone, before = _data(workers=2), _batches(_data(), 6), set(multiprocessing.active_children())
     data.setup()
     batches = iter(data.train_dataloader())
@@ -138,7 +127,6 @@ def test_workers_outlast_a_signal_to_the_whole_group_until_the_trainer_has_ended
     workers = set(multiprocessing.active_children()) - before
     assert len(workers) == 2
     for worker in workers:
-        assert worker.pid is not None
         os.kill(worker.pid, signal.SIGTERM)
     time.sleep(0.3)  # a worker that has ended is an error as soon as its parent hears of it
     assert _equal([first, *itertools.islice(batches, 5)], alone)
@@ -147,34 +135,34 @@ def test_workers_outlast_a_signal_to_the_whole_group_until_the_trainer_has_ended
     assert not any(worker.is_alive() for worker in workers)
 
 
-def test_first_patches_can_be_requested() -> None:
+def test_first_patches_can_be_requested():
     data = _data()
     first = _batches(data, 2)
     for i, patch in enumerate(data.first_patches(4)):
         assert all(torch.equal(patch[name], first[i // 2][name][i % 2]) for name in patch)
 
 
-def test_loader_begins_at_the_trainers_step_and_has_the_length_of_the_training() -> None:
+def test_loader_begins_at_the_trainers_step_and_has_the_length_of_the_training():
     data = _data(colour=0.1)
     whole = _batches(data, 6)
     assert _equal(_batches(data, 2, 4), whole[4:])
     assert _equal(_batches(data, 2, 2, accumulate=2), whole[4:])
     assert len(data.train_dataloader()) == 16  # as Lightning counts the batches that were done, too
     assert len(list(data.train_dataloader())) == 12
-    data.trainer.max_steps = -1  # type: ignore[union-attr]
+    data.trainer.max_steps = -1
     assert len(data.train_dataloader()) == 1000
     data.trainer = None
     assert len(data.train_dataloader()) == 1000
 
 
-def test_devices_share_the_batches_of_a_step() -> None:
+def test_devices_share_the_batches_of_a_step():
     data = _data(colour=0.1)
     whole = _batches(data, 6)
     assert _equal(_batches(data, 2, 1, rank=0, world=2), [whole[2], whole[4]])
     assert _equal(_batches(data, 2, 1, rank=1, world=2), [whole[3], whole[5]])
 
 
-def test_held_out_scenes_are_validated_whole_and_never_trained_on() -> None:
+def test_held_out_scenes_are_validated_whole_and_never_trained_on():
     data = _data()
     assert sum(len(names) for _, names in data.trained) == 4
     assert {kind: names for kind, (_, names) in data.held_out.items()} == {"set": ["scene4", "scene5"]}
@@ -188,61 +176,48 @@ def test_held_out_scenes_are_validated_whole_and_never_trained_on() -> None:
     torch.testing.assert_close(whole[0]["depth"][0], _tilted(CAMERA), rtol=0, atol=0)
 
 
-def test_dataset_can_be_limited_to_its_first_scenes() -> None:
-    sources = [Part(_Source([_scene(i) for i in range(6)]))]
-    data = PatchData(sources, _settings(scenes=3, validation_scenes=1), X4)
-    assert data.trained[0][1] == ["scene0", "scene1"]
-    assert data.held_out["set"][1] == ["scene2"]
-
-
-def test_parts_give_patches_by_their_fractions() -> None:
-    parts = [_scene(0)], [_scene(1), _scene(2)], [_scene(3)]
+def test_parts_give_patches_by_their_fractions_and_scenes_in_turn_also_with_sparse_depth():
+    sparse = torch.full((1, 44, 60), torch.nan, dtype=torch.float64)
+    sparse[0, ::3, ::3] = 2.0
+    parts = [_scene(0)], [_scene(1), _scene(2, depth=sparse)], [_scene(3)]
     patches = Patches(parts, _settings(), X4, shares=[1, 3, 0])
     seen = np.array([_places(patches[i])[2] for i in range(400)])
     assert np.bincount(seen, minlength=4) / 400 == pytest.approx([0.25, 0.375, 0.375, 0], abs=0.07)
 
 
-def test_part_keeps_its_fraction_and_a_scene_its_turn_with_sparse_depth() -> None:
-    sparse = torch.full((1, 44, 60), torch.nan, dtype=torch.float64)
-    sparse[0, ::3, ::3] = 2.0
-    patches = Patches([[_scene(0)], [_scene(1), _scene(2, depth=sparse)]], _settings(), X4, shares=[2, 2])
-    seen = np.array([_places(patches[i])[2] for i in range(400)])
-    assert np.bincount(seen) / 400 == pytest.approx([0.5, 0.25, 0.25], abs=0.07)
-
-
-def test_parts_hold_out_their_last_scenes_under_distinct_names() -> None:
-    sources = [_Source([_scene(i) for i in numbers]) for numbers in ((0, 1, 2), (3, 4))]
-    data = PatchData([Part(source) for source in sources], _settings(validation_scenes=1), X4)
+def test_parts_hold_out_the_last_of_their_first_scenes_under_distinct_names():
+    sources = [_Source([_scene(i) for i in numbers]) for numbers in ((0, 1, 2, 5), (3, 4))]
+    data = PatchData([Part(source) for source in sources], _settings(validation_scenes=1, scenes=3), X4)
     assert data.trained == [(sources[0], ["scene0", "scene1"]), (sources[1], ["scene3"])]
     assert data.held_out == {"set": (sources[0], ["scene2"]), "set_2": (sources[1], ["scene4"])}
     data.setup()
     assert [next(iter(loader))["rgb"][0, 2, 0, 0] * 255 for loader in data.val_dataloader()] == pytest.approx([2, 4])
 
 
-def test_other_datasets_validate_whole_and_alone_where_nothing_is_held_out() -> None:
-    more: dict[str, SceneSource] = {"mine": _Source([_scene(8), BARE, _scene(9)])}
+def test_other_datasets_validate_whole_and_alone_where_nothing_is_held_out():
+    more = {"mine": _Source([_scene(8), BARE, _scene(9)])}
     data = PatchData([Part(_Source([_scene(0)]))], _settings(validation_scenes=0), X4, validation=more)
     data.setup()
     assert {name: scenes for name, (_, scenes) in data.held_out.items()} == {"mine": ["scene8", "scene9"]}
-    with pytest.raises(ValueError, match=r"^validation_scenes: expected a positive number where there is no"):
+    with pytest.raises(ValueError, match=r"^validation_scenes: expected"):
         _data(validation_scenes=0)
 
 
-def test_training_scene_cannot_validate_under_another_name() -> None:
+def test_training_scene_cannot_validate_under_another_name():
     class _Copies(_Source):
-        def fingerprint(self, scene: str) -> str:
+        def fingerprint(self, scene):
             return "the same" if scene in ("scene1", "scene8") else scene
 
     parts = [Part(_Copies([_scene(i) for i in range(6)]))]
-    with pytest.raises(ValueError, match=r"validation.mine: expected scenes that are not trained on, got scene8"):
+    with pytest.raises(ValueError, match=r"validation.mine: expected"):
         PatchData(parts, _settings(), X4, validation={"mine": _Copies([_scene(8)])})
     other = PatchData(parts, _settings(), X4, validation={"mine": _Copies([_scene(9)])})
     assert list(other.held_out) == ["set", "mine"]
 
 
-def test_patches_reach_every_row_and_column_of_a_scene() -> None:
+def test_patches_reach_every_row_and_column_of_a_scene():
     patches = _patches()
-    seen: tuple[set[int], set[int]] = (set(), set())
+    seen = (set(), set())
     for i in range(400):
         for places, reached in zip(_places(patches[i])[:2], seen, strict=True):
             reached.update(places.flatten().tolist())
@@ -250,7 +225,7 @@ def test_patches_reach_every_row_and_column_of_a_scene() -> None:
 
 
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
-def test_patch_has_the_points_of_its_pixels_in_the_scene_up_to_the_mirror(camera: Camera) -> None:
+def test_patch_has_the_points_of_its_pixels_in_the_scene_up_to_the_mirror(camera):
     bumps = torch.from_numpy(np.random.default_rng(0).uniform(1, 3, (1, 44, 60)))
     full = (bumps * camera.rays()).numpy()
     patches, mirrors = _patches([_scene(camera=camera, depth=bumps)]), set()
@@ -266,7 +241,7 @@ def test_patch_has_the_points_of_its_pixels_in_the_scene_up_to_the_mirror(camera
 
 
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
-def test_low_resolution_disparity_is_the_box_mean_in_high_resolution_pixels(camera: Camera) -> None:
+def test_low_resolution_disparity_is_the_box_mean_in_high_resolution_pixels(camera):
     patches = _patches([_scene(camera=camera)])
     for i in range(10):
         patch = patches[i]
@@ -278,22 +253,8 @@ def test_low_resolution_disparity_is_the_box_mean_in_high_resolution_pixels(came
         np.testing.assert_allclose((patch["bf"] / patch["depth"] - patch["doffs"])[0].numpy(), fine, rtol=1e-5)
 
 
-def test_network_input_depends_on_the_low_resolution_map_alone() -> None:
-    """High-resolution depth that changes within its blocks, far beyond the low-resolution range, leaves no trace."""
-    disparity = 50 * 0.2 / _tilted(CAMERA)
-    checker = torch.tensor([[1.0, -1.0], [-1.0, 1.0]]).repeat(22, 30).double()
-    plain, wild = (_scene(depth=50 * 0.2 / (disparity + swing * checker)) for swing in (0.0, 2.5))
-    first, second = (to_tensors(make_sample(scene, 4, BOX, "disparity")) for scene in (plain, wild))
-    assert (first["depth"] - second["depth"]).abs().min() > 0.1
-    assert second["depth"].max() > 1.2 * first["depth"].max()
-    assert torch.equal(first["rgb"], second["rgb"])
-    torch.testing.assert_close(second["disparity_lr"], first["disparity_lr"], rtol=1e-6, atol=0)
-    for one, other in zip(*(normalise(each["disparity_lr"][None]) for each in (first, second)), strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
-
-
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
-def test_min_max_lies_between_the_patchs_and_the_scenes_and_half_are_the_scenes(camera: Camera) -> None:
+def test_min_max_lies_between_the_patchs_and_the_scenes_and_half_are_the_scenes(camera):
     """The scene's, as the patch's camera counts it: turned, and nearer or farther."""
     patches = _patches([_scene(camera=camera)], rotate=True, depth_scale=0.5)
     coarse = 1 / (1 / _tilted(camera)).reshape(11, 4, 15, 4).mean(dim=(1, 3)).numpy()
@@ -316,7 +277,7 @@ def test_min_max_lies_between_the_patchs_and_the_scenes_and_half_are_the_scenes(
     assert between.std() == pytest.approx(12**-0.5, abs=0.05)  # of a uniform distribution
 
 
-def test_min_max_of_a_noisy_patch_contains_its_low_resolution_map_or_is_the_clean_scenes() -> None:
+def test_min_max_of_a_noisy_patch_contains_its_low_resolution_map_or_is_the_clean_scenes():
     patches = Patches([[_scene()]], _settings(), Degradation(4, BOX, GaussianMultiplicative(0.005)))
     coarse = 10 * (1 / _tilted(CAMERA)).reshape(11, 4, 15, 4).mean(dim=(1, 3))
     clean = 0
@@ -329,7 +290,7 @@ def test_min_max_of_a_noisy_patch_contains_its_low_resolution_map_or_is_the_clea
     assert clean > 15
 
 
-def test_min_max_of_a_whole_scene_is_its_low_resolution_maps_and_that_of_a_wall_has_width() -> None:
+def test_min_max_of_a_whole_scene_is_its_low_resolution_maps_and_that_of_a_wall_has_width():
     whole = WholeScenes([_scene()], X4)[0]
     assert whole["min_max"].flatten().tolist() == pytest.approx(
         [float(whole["disparity_lr"].min()), float(whole["disparity_lr"].max())]
@@ -340,7 +301,7 @@ def test_min_max_of_a_whole_scene_is_its_low_resolution_maps_and_that_of_a_wall_
     assert high == pytest.approx(5.005)
 
 
-def test_noise_is_new_in_every_patch_and_the_same_in_every_run() -> None:
+def test_noise_is_new_in_every_patch_and_the_same_in_every_run():
     noisy = Degradation(4, BOX, GaussianMultiplicative(0.01))
     wall = _scene(depth=torch.full((1, 44, 60), 2.0, dtype=torch.float64))
     first, again = (Patches([[wall]], _settings(), noisy) for _ in range(2))
@@ -354,8 +315,10 @@ def test_noise_is_new_in_every_patch_and_the_same_in_every_run() -> None:
     assert not torch.equal(whole, other)
 
 
-def test_colour_is_a_gain_per_channel_of_the_given_spread() -> None:
-    grey = replace(_scene(), rgb=torch.full((3, 44, 60), 0.4))
+def test_colour_is_a_gain_per_channel_of_the_given_spread():
+    bright, grey = (replace(_scene(), rgb=torch.full((3, 44, 60), value)) for value in (0.97, 0.4))
+    assert all(float(_patches([bright], colour=0.5)[i]["rgb"].max()) <= 1 for i in range(20))
+    assert torch.equal(_patches([bright])[0]["rgb"], torch.full((3, SIZE, SIZE), 0.97))  # off
     patches = _patches([grey], colour=0.1)
     gains = np.stack([patches[i]["rgb"].numpy() / 0.4 for i in range(300)])
     assert np.ptp(gains, axis=(2, 3)).max() < 1e-6
@@ -365,14 +328,7 @@ def test_colour_is_a_gain_per_channel_of_the_given_spread() -> None:
     assert np.abs(np.corrcoef(gains.T)[np.triu_indices(3, 1)]).max() < 0.2
 
 
-def test_colour_stays_within_its_range_and_is_unchanged_when_off() -> None:
-    bright = replace(_scene(), rgb=torch.full((3, 44, 60), 0.97))
-    strong, off = _patches([bright], colour=0.5), _patches([bright])
-    assert all(0 <= strong[i]["rgb"].min() <= strong[i]["rgb"].max() <= 1 for i in range(40))
-    assert all(torch.equal(off[i]["rgb"], torch.full((3, SIZE, SIZE), 0.97)) for i in range(5))
-
-
-def test_given_fraction_of_the_photos_gets_another_gamma_blur_and_noise() -> None:
+def test_given_fraction_of_the_photos_gets_another_gamma_blur_and_noise():
     step = replace(_scene(), rgb=(0.2 + 0.6 * (torch.arange(60.0) >= 30)).expand(3, 44, 60).contiguous())
     patches = _patches([step], photo=0.5, flip=False)
     changed = [patch["rgb"] for patch in (patches[i] for i in range(400)) if len(patch["rgb"].unique()) > 2]
@@ -386,7 +342,7 @@ def test_given_fraction_of_the_photos_gets_another_gamma_blur_and_noise() -> Non
     assert all(photo.min() >= 0 and photo.max() <= 1 for photo in changed)
 
 
-def test_holes_are_kept_and_half_of_a_patch_is_valid_where_possible() -> None:
+def test_holes_are_kept_and_half_of_a_patch_is_valid_where_possible():
     depth = _tilted(CAMERA)
     depth[:, :, :30] = torch.nan
     patches, shares = _patches([_scene(depth=depth)]), []
@@ -400,47 +356,36 @@ def test_holes_are_kept_and_half_of_a_patch_is_valid_where_possible() -> None:
     assert 0.5 <= min(shares) < 1
 
 
-def test_batches_have_the_documented_shapes_and_types() -> None:
+def test_batches_have_the_documented_shapes_and_types():
     shapes = {
-        "rgb": (3, 16, 16),
-        "disparity_lr": (1, 4, 4),
-        "depth": (1, 16, 16),
-        "rays": (3, 16, 16),
-        "bf": (1, 1, 1),
-        "doffs": (1, 1, 1),
-        "min_max": (2, 1, 1),
-    }
-    patch = _patches()[0]
+        "rgb": (3, 16, 16), "disparity_lr": (1, 4, 4), "depth": (1, 16, 16), "rays": (3, 16, 16), "bf": (1, 1, 1),
+        "doffs": (1, 1, 1), "min_max": (2, 1, 1),
+    }  # fmt: skip
+    patch, whole = _patches()[0], WholeScenes([_scene()], X4)[0]
     assert {name: tuple(value.shape) for name, value in patch.items()} == shapes
     assert {value.dtype for value in patch.values()} == {torch.float32}
-    whole = WholeScenes([_scene()], X4)[0]
-    single = {"rgb", "min_max"}
     assert Unit(**whole.pop("unit")) == CENTIMETRES
-    assert all(value.dtype == (torch.float32 if name in single else torch.float64) for name, value in whole.items())
+    single = {name for name, value in whole.items() if value.dtype == torch.float32}
+    assert single == {"rgb", "min_max"}
 
 
 SMALL = _scene(1, replace(CAMERA, width=60, height=30))
 BARE = Scene("set", "bare", _scene().rgb, CAMERA, None, {4: torch.ones(1, 11, 15)})
 
 
-def test_measured_map_cannot_be_cropped() -> None:
-    patches = Patches([[_scene()]], _settings(), Degradation(4, Measured()))  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="downsampling=measured expects a low-resolution map at x4"):
+def test_measured_map_cannot_be_cropped():
+    patches = Patches([[_scene()]], _settings(), Degradation(4, Measured()))
+    with pytest.raises(ValueError, match="downsampling=measured expects"):
         patches[0]
 
 
-def test_measured_maps_to_validate_with_have_the_hints_of_the_assumed_model() -> None:
+def test_measured_maps_to_validate_with_have_the_hints_of_the_assumed_model():
     scene = replace(_scene(), measured={4: torch.ones(1, 11, 15)})
-    [batch] = WholeScenes([scene], Degradation(4, Measured("bicubic")), hinted=True)  # type: ignore[arg-type]
+    [batch] = WholeScenes([scene], Degradation(4, Measured("bicubic")), hinted=True)
     assert torch.equal(batch["facts"], encode_facts("bicubic", soft=False, noise=True)[None])
 
 
-REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
-    **{
-        f"{key}={value}": (lambda key=key, value=value: _settings(**{key: value}), f"^{key}: expected ")
-        for key, value in (("patch", 15), ("batch", 0), ("validation_scenes", -1), ("photo", 1.1), ("workers", -1),
-                           ("depth_scale", -0.1), ("colour", -0.1), ("colour", float("nan")), ("scenes", 0))
-    },
+REFUSALS = {
     **{
         f"shares={shares}": (
             lambda shares=shares: Patches(len(shares) * [[_scene()]], _settings(), X4, shares=shares),
@@ -466,29 +411,27 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSALS)
-def test_value_out_of_range_is_refused_by_its_key(case: str) -> None:
+def test_value_out_of_range_is_refused_by_its_key(case):
     act, message = REFUSALS[case]
     with pytest.raises(ValueError, match=message):
         act()
 
 
-def test_window_that_noise_leaves_empty_is_replaced_by_another() -> None:
+def test_window_that_noise_leaves_empty_is_replaced_by_another():
     far = _scene(1, depth=torch.full((1, CAMERA.height, CAMERA.width), 50.0, dtype=torch.float64))
     degradation = Degradation(4, BOX, Kinect(nearest=None, farthest=20.0))
     patches = Patches([[far, _scene()]], _settings(), degradation)
     for index in range(8):
         assert patches[index]["depth"].nanmean() < 20
-    with pytest.raises(
-        ValueError, match="patches: expected low-resolution maps with a known pixel or more; noise makes all"
-    ):
+    with pytest.raises(ValueError, match="patches: expected"):
         Patches([[far]], _settings(), degradation)[0]
 
 
-def _degraded(scenes: list[Scene], everything: Everything, batch: int = 2, size: int = SIZE, **changes: Any) -> Patches:
+def _degraded(scenes, everything, batch=2, size=SIZE, **changes):
     return Patches([scenes], _settings(patch=size, batch=batch, **changes), X4, everything=everything)
 
 
-def test_degraded_patches_are_pure_functions_of_their_number_and_describe_themselves() -> None:
+def test_degraded_patches_are_pure_functions_of_their_number_and_describe_themselves():
     scenes = [_scene(number) for number in range(3)]
     first, again = (_degraded(scenes, Everything(soft=0.5)) for _ in range(2))
     for index in (7, 0, 3):
@@ -503,14 +446,14 @@ def test_degraded_patches_are_pure_functions_of_their_number_and_describe_themse
         assert not bool(reported.any()) or bool(reported[int(patch["soft"])])
 
 
-def test_all_patches_of_a_batch_have_one_factor() -> None:
+def test_all_patches_of_a_batch_have_one_factor():
     patches = _degraded([_scene()], Everything(scales={1: 0.5, 2: 0.5}, holes={"none": 1}), batch=3)
     factors = [SIZE // patches[index]["disparity_lr"].shape[-1] for index in range(36)]
     assert all(len(set(factors[i : i + 3])) == 1 for i in range(0, 36, 3))
     assert set(factors) == {1, 2}
 
 
-def test_soft_patches_of_scenes_with_holes_of_several_sizes_are_soft() -> None:
+def test_soft_patches_of_scenes_with_holes_of_several_sizes_are_soft():
     """A step gets mixed pixels, holes stay holes, and a map of a sensor is no obstacle."""
     scenes = []
     for number, (height, width) in enumerate(((16, 16), (44, 60), (80, 64))):
@@ -536,7 +479,7 @@ def test_soft_patches_of_scenes_with_holes_of_several_sizes_are_soft() -> None:
 WIDE = Camera(width=31, height=23, fx=30.0, fy=27.0, cx=13.3, cy=9.9, baseline=0.1, doffs=0.7)
 
 
-def _waves() -> Scene:
+def _waves():
     random = np.random.default_rng(0)
     v, u = np.mgrid[:23, :31]
     depth = torch.from_numpy(2 + 0.03 * u + 0.2 * np.sin(u / 3) * np.cos(v / 4))[None]
@@ -545,49 +488,35 @@ def _waves() -> Scene:
     return Scene("set", "waves", rgb, WIDE, depth, {1: depth})
 
 
-def _quarter(vectors: Tensor) -> Tensor:
+def _quarter(vectors):
     """Return vectors turned counterclockwise about the axis, as a picture with y down shows it."""
     x, y, z = vectors
     return torch.stack((y, -x, z))
 
 
-def _points(scene: Scene) -> Tensor:
-    assert scene.depth is not None
+def _points(scene):
     return scene.depth * scene.camera.rays()
 
 
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
-def test_turned_scene_has_the_turned_points(turns: int) -> None:
-    expected = _points(_waves()).rot90(turns, (-2, -1))
+def test_turned_scene_has_the_turned_points(turns):
+    expected, scene = _points(_waves()).rot90(turns, (-2, -1)), rotate90(_waves(), turns)
     for _ in range(turns):
         expected = _quarter(expected)
-    torch.testing.assert_close(_points(rotate90(_waves(), turns)), expected, rtol=0, atol=1e-12, equal_nan=True)
-
-
-def test_four_quarter_turns_and_two_mirrors_restore_the_waves() -> None:
-    scene = _waves()
-    there = rotate90(rotate90(rotate90(rotate90(scene, 1), 1), 1), 1)
-    twice = mirror(mirror(scene, vertical=True), vertical=True)
-    for other in (there, twice):
-        assert torch.equal(other.rgb, scene.rgb)
-        torch.testing.assert_close(_points(other), _points(scene), rtol=0, atol=1e-12, equal_nan=True)
-        assert not other.measured  # which would have to be turned, too
-    assert rotate90(scene, 4) is scene
-    both = mirror(mirror(scene), vertical=True)
-    half = rotate90(scene, 2)
-    assert torch.equal(both.rgb, half.rgb)
-    assert both.camera == half.camera
+    torch.testing.assert_close(_points(scene), expected, rtol=0, atol=1e-12, equal_nan=True)
+    assert torch.equal(scene.rgb, _waves().rgb.rot90(turns, (-2, -1)))
+    assert not turns or not scene.measured  # which would have to be turned, too
 
 
 @pytest.mark.parametrize("vertical", [False, True])
-def test_mirrored_scene_has_the_mirrored_points(vertical: bool) -> None:
+def test_mirrored_scene_has_the_mirrored_points(vertical):
     sign = torch.tensor([1.0, -1.0, 1.0] if vertical else [-1.0, 1.0, 1.0], dtype=torch.float64)[:, None, None]
     expected = sign * _points(_waves()).flip(-2 if vertical else -1)
     shown = _points(mirror(_waves(), vertical=vertical))
     torch.testing.assert_close(shown, expected, rtol=0, atol=1e-12, equal_nan=True)
 
 
-def test_factor_of_a_varied_scene_is_that_of_its_depth() -> None:
+def test_factor_of_a_varied_scene_is_that_of_its_depth():
     settings = PatchSettings(flip=False, rotate=False, depth_scale=0.5, colour=0.0)
     random, factors = np.random.default_rng(0), []
     for _ in range(200):

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
+from small_scenes import seeded
 from torch.nn import functional
 
-from dsr.degradation.downsampling import FACTS, KERNELS, Downsampling, Kernel, encode_facts, local_noise
+from dsr.degradation.downsampling import FACTS, KERNELS, Downsampling, encode_facts, local_noise
 from dsr.degradation.noise import NOISES
 from dsr.degradation.random_degradation import Everything, add_folds, displace
 from dsr.geometry.camera import Camera
@@ -18,7 +18,7 @@ from dsr.training.patches import soften
 CLEAN = Everything(noises={"none": 1}, holes={"none": 1}, displaced=0, rounded=0, folds=0, relief=0, told=1)
 
 
-def _scene(size: int = 128, step: bool = True) -> Scene:
+def _scene(size=128, step=True):
     """Return a slope with a nearer square on it."""
     depth = torch.linspace(2, 3, size, dtype=torch.float64).repeat(1, size, 1)
     if step:
@@ -27,44 +27,40 @@ def _scene(size: int = 128, step: bool = True) -> Scene:
     return Scene("test", "slope", rgb, Camera.from_fov(60, size, size), depth)
 
 
-def _averaged(depth: Tensor, depth_lr: Tensor, scale: int, kernel: Kernel = "box") -> str | None:
+def _averaged(depth, depth_lr, scale, kernel="box"):
     """Return whether a map has averages of inverse depth or, as some have, of depth."""
     model, fine = Downsampling(kernel), depth.float()
     means = {"inverse": model(fine.reciprocal(), scale).reciprocal(), "depth": model(fine, scale)}
     return next((name for name, each in means.items() if torch.allclose(depth_lr, each, rtol=1e-5)), None)
 
 
-def _generator(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
-def _relative_error(kind: str, seed: int, scale: int = 2) -> Tensor:
+def _relative_error(kind, seed, scale=2):
     """Return the relative error of inverse depth that a kind of noise makes on a slope, (1, h, w)."""
     everything = replace(CLEAN, noises={kind: 1}, kernels={"box": 1})
-    sample, _ = everything(_scene(256, step=False), scale, _generator(seed))
-    clean, _ = replace(everything, noises={"none": 1})(_scene(256, step=False), scale, _generator(seed))
+    sample, _ = everything(_scene(256, step=False), scale, seeded(seed))
+    clean, _ = replace(everything, noises={"none": 1})(_scene(256, step=False), scale, seeded(seed))
     return (clean.depth_lr / sample.depth_lr).float() - 1
 
 
 @pytest.mark.parametrize("scale", [1, 2, 4, 8, 16])
-def test_a_degradation_is_a_function_of_its_generator(scale: int) -> None:
+def test_a_degradation_is_a_function_of_its_generator(scale):
     scene = _scene(32 * max(4, scale))
     for seed in range(12):
-        first, again = (Everything()(scene, scale, _generator(seed)) for _ in range(2))
+        first, again = (Everything()(scene, scale, seeded(seed)) for _ in range(2))
         torch.testing.assert_close(first[0].depth_lr, again[0].depth_lr, rtol=0, atol=0, equal_nan=True)
         assert torch.equal(first[1].facts, again[1].facts)
         assert first[0].depth_lr.shape == (1, *(n // scale for n in scene.rgb.shape[1:]))
         assert bool((first[0].depth_lr.nan_to_num(1) > 0).all())
-    other, _ = Everything()(scene, scale, _generator(100))
+    other, _ = Everything()(scene, scale, seeded(100))
     assert not torch.equal(other.depth_lr.nan_to_num(0), first[0].depth_lr.nan_to_num(0))
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_clean_maps_are_those_of_the_kernel_and_hints_name_it(kernel: Kernel) -> None:
+def test_clean_maps_are_those_of_the_kernel_and_hints_name_it(kernel):
     everything = replace(CLEAN, kernels={kernel: 1})
     found = set()
     for seed in range(20):
-        sample, hints = everything(_scene(), 4, _generator(seed), soft=seed % 2 == 1)
+        sample, hints = everything(_scene(), 4, seeded(seed), soft=seed % 2 == 1)
         found.add(_averaged(_scene().true_depth, sample.depth_lr, 4, kernel))
         facts = torch.zeros(FACTS)
         facts[KERNELS.index(kernel)] = facts[len(KERNELS) + seed % 2] = facts[-1] = 1
@@ -73,18 +69,13 @@ def test_clean_maps_are_those_of_the_kernel_and_hints_name_it(kernel: Kernel) ->
     assert found == {"inverse"} | ({"depth"} if kernel != "nearest" else set())
 
 
-def test_there_are_no_hints_where_there_are_to_be_none() -> None:
-    for seed in range(10):
-        _, hints = replace(Everything(), told=0)(_scene(), 4, _generator(seed))
-        assert not bool(hints.facts.any())
-        assert not bool(hints.noise.any())
-
-
 @pytest.mark.parametrize("kind", ["white", "correlated", "waves", "structured", "flight", "lidar", "stereo"])
-def test_hint_of_the_noise_is_as_large_as_it_is(kind: str) -> None:
+def test_hint_of_the_noise_is_as_large_as_it_is(kind):
     everything = replace(CLEAN, noises={kind: 1}, kernels={"box": 1})
     for seed in range(6):
-        sample, hints = everything(_scene(256, step=False), 2, _generator(seed))
+        sample, hints = everything(_scene(256, step=False), 2, seeded(seed))
+        _, untold = replace(everything, told=0)(_scene(256, step=False), 2, seeded(seed))
+        assert not bool(untold.facts.any() or untold.noise.any())
         error = _relative_error(kind, seed)
         measured = float(error[error.isfinite()].clamp(-0.1, 0.1).square().mean().sqrt())
         assert 1e-4 < measured < 0.1
@@ -92,8 +83,8 @@ def test_hint_of_the_noise_is_as_large_as_it_is(kind: str) -> None:
         assert bool(sample.depth_lr.isfinite().any())
 
 
-def test_white_noise_is_white_and_correlated_noise_is_not() -> None:
-    def neighbours(kind: str, seed: int) -> float:
+def test_white_noise_is_white_and_correlated_noise_is_not():
+    def neighbours(kind, seed):
         error = _relative_error(kind, seed).nan_to_num(0)
         error = error - error.mean()
         return float((error[..., 1:] * error[..., :-1]).mean() / error.square().mean())
@@ -103,21 +94,21 @@ def test_white_noise_is_white_and_correlated_noise_is_not() -> None:
 
 
 @pytest.mark.parametrize("kind", ["blobs", "shadows", "steps", "dark", "pixels"])
-def test_holes_are_made_and_never_everywhere(kind: str) -> None:
+def test_holes_are_made_and_never_everywhere(kind):
     everything = replace(CLEAN, holes={kind: 1})
     shares = []
     for seed in range(10):
-        sample, _ = everything(_scene(), 2, _generator(seed))
+        sample, _ = everything(_scene(), 2, seeded(seed))
         shares.append(float(sample.depth_lr.isnan().float().mean()))
     assert 0 < sum(shares) / 10 < 0.5
     assert max(shares) < 0.8
 
 
-def test_displacement_is_a_shift_or_a_magnification() -> None:
+def test_displacement_is_a_shift_or_a_magnification():
     places = torch.arange(200.0).repeat(1, 200, 1)
     shifts = magnified = 0
     for seed in range(30):
-        moves = (displace(places, 8, _generator(seed)) - places)[0, 0, 10:-10]
+        moves = (displace(places, 8, seeded(seed)) - places)[0, 0, 10:-10]
         assert float(moves.abs().max()) <= 8
         shifts += bool(moves.min() == moves.max())
         magnified += bool(moves.max() - moves.min() > 4)
@@ -126,43 +117,44 @@ def test_displacement_is_a_shift_or_a_magnification() -> None:
     assert magnified > 5
 
 
-def test_noisy_maps_are_displaced_as_often_as_stated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_noisy_maps_are_displaced_as_often_as_stated(monkeypatch):
     quiet = {**NOISES, "white": lambda clean, *_: clean}
     monkeypatch.setattr("dsr.degradation.random_degradation.NOISES", quiet)
     scene = _scene(step=False)
     for share in (0.0, 1.0):
         everything = replace(CLEAN, noises={"white": 1}, kernels={"box": 1}, displaced=share)
         for seed in range(4):
-            sample, _ = everything(scene, 8, _generator(seed))
+            sample, _ = everything(scene, 8, seeded(seed))
             assert (_averaged(scene.true_depth, sample.depth_lr, 8) is None) == bool(share)
 
 
-def test_soft_scenes_have_half_the_size_and_mixed_values_at_steps() -> None:
+def test_folds_keep_holes_and_shade_their_surroundings():
+    scene = _scene(64)
+    depth = scene.depth.clone()
+    depth[:, 30:40, 10:20] = torch.nan
+    for seed in range(5):
+        folded = add_folds(replace(scene, depth=depth), seeded(seed))
+        assert torch.equal(folded.depth.isnan(), depth.isnan())
+        assert bool(folded.rgb.isfinite().all())
+        assert float(folded.depth.nan_to_num(1).min()) > 0
+
+
+def test_soft_scenes_have_half_the_size_and_mixed_values_at_steps():
     scene = _scene(126)
     soft = soften(scene)
     assert (soft.camera.width, soft.camera.height) == (63, 63)
-    assert soft.depth is not None
-    assert scene.depth is not None
     blocks = scene.depth.reciprocal().unfold(1, 2, 2).unfold(2, 2, 2).mean(dim=(-2, -1)).reciprocal()
     torch.testing.assert_close(soft.depth, blocks)
+    whole = soften(scene, 1.0, halve=False)
+    assert whole.camera == scene.camera
+    assert torch.equal(whole.rgb, scene.rgb)
+    assert 2 <= int(((whole.depth > 1.25) & (whole.depth < 1.95))[0, 36].sum()) <= 10  # across edges of the square
     assert soft.camera.fx == pytest.approx(scene.camera.fx / 2)
     assert bool(((soft.depth > 1.25) & (soft.depth < 1.95)).any())  # neither the square nor the slope
 
 
-def test_soft_scenes_may_keep_their_size() -> None:
-    scene = _scene(96)
-    soft = soften(scene, 1.0, halve=False)
-    assert soft.camera == scene.camera
-    assert torch.equal(soft.rgb, scene.rgb)
-    assert soft.depth is not None
-    assert scene.depth is not None
-    mixed = (soft.depth > 1.25) & (soft.depth < 1.95)
-    assert 2 <= int(mixed[0, 36].sum()) <= 10  # across both edges of the square
-    torch.testing.assert_close(soft.depth[0, 80:, 4:-4], scene.depth[0, 80:, 4:-4], rtol=1e-3, atol=0)
-
-
-def test_factors_are_drawn_as_often_as_their_shares_say() -> None:
-    generator = _generator()
+def test_factors_are_drawn_as_often_as_their_shares_say():
+    generator = seeded()
     shares = {1: 0.6, 2: 0.3, 16: 0.1}
     drawn = [Everything(shares).draw_scale(4, generator) for _ in range(2000)]
     assert Everything().draw_scale(4, generator) == 4  # that of the run
@@ -170,52 +162,32 @@ def test_factors_are_drawn_as_often_as_their_shares_say() -> None:
         assert drawn.count(scale) / 2000 == pytest.approx(share, abs=4 * math.sqrt(share / 2000))
 
 
-def test_relief_is_in_the_truth_and_its_means_in_the_map() -> None:
+def test_relief_is_in_the_truth_and_its_means_in_the_map():
     everything = replace(CLEAN, kernels={"box": 1}, relief=1)
     scene, rough = _scene(step=False), 0
-    assert scene.depth is not None
     for seed in range(20):
-        sample, hints = everything(scene, 4, _generator(seed))
-        assert sample.depth is not None
+        sample, hints = everything(scene, 4, seeded(seed))
         change = (sample.depth / scene.depth - 1).abs()
         assert 1e-6 < float(change.mean()) < 0.02
         rough += float(change.mean()) > 1e-4
         assert _averaged(sample.depth, sample.depth_lr, 4), seed
         assert float(hints.noise.max()) < 1e-6, "the map has no noise"
     assert 3 < rough < 20
-    same, _ = replace(everything, noises={"white": 1})(scene, 1, _generator())
+    same, _ = replace(everything, noises={"white": 1})(scene, 1, seeded())
     assert same.depth is scene.depth, "at factor 1 relief could not be distinguished from noise"
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"kernels": {"sinc": 1}}, "kernels: expected some of box, .*, spread, got sinc"),
-        ({"noises": {"foo": 0.1}}, "noises: expected some of none, white, .*, got foo"),
-        ({"holes": {"none": -1}}, "holes: expected frequencies of 0 or more"),
-        ({"noises": {"none": 0}}, "noises: expected frequencies of 0 or more, one of them positive"),
-        ({"soft": 1.5}, "soft: expected a fraction from 0 to 1, got 1.5"),
-        ({"clear": 2}, "clear: expected a fraction from 0 to 1, got 2"),
-        ({"scales": {3: 1}}, "scales: expected some of 1, 2, 4, 8, 16, got 3"),
-    ],
-)
-def test_unknown_kinds_and_impossible_fractions_are_refused(wrong: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Everything(**wrong)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize("kind", ["white", "correlated", "waves", "structured", "flight", "lidar", "stereo"])
-def test_holes_of_the_truth_leave_their_surroundings_alone(kind: str) -> None:
+def test_holes_of_the_truth_leave_their_surroundings_alone(kind):
     """Noise beside a hole is as large as elsewhere, and nothing is taken for a depth of 0 or of the mean."""
     scene = _scene(256, step=False)
-    assert scene.depth is not None
     depth = scene.depth.clone()
     depth[:, 100:140, 60:180] = torch.nan
     everything = replace(CLEAN, noises={kind: 1}, kernels={"nearest": 1}, told=0)
     for seed in range(12):
-        sample, _ = everything(replace(scene, depth=depth), 2, _generator(seed))
+        sample, _ = everything(replace(scene, depth=depth), 2, seeded(seed))
         assert bool(sample.depth_lr[:, 50:70, 30:90].isnan().all())
-        clean, _ = everything(scene, 2, _generator(100))
+        clean, _ = everything(scene, 2, seeded(100))
         truth = Downsampling("nearest")(scene.depth.float(), 2)
         error = (sample.depth_lr.float() / truth - 1).abs()
         beside = error[:, 45:75, 25:95]
@@ -223,15 +195,13 @@ def test_holes_of_the_truth_leave_their_surroundings_alone(kind: str) -> None:
         assert float(beside.nan_to_num(0).max()) < 0.02 + 3 * float(error[:, 90:].nan_to_num(0).max()), seed
 
 
-def test_folds_are_in_truth_map_and_photo_and_only_in_places() -> None:
+def test_folds_are_in_truth_map_and_photo_and_only_in_places():
     scene = _scene(256, step=False)
     scene = replace(scene, rgb=torch.full_like(scene.rgb, 0.5))
-    assert scene.depth is not None
     everything = replace(CLEAN, kernels={"box": 1}, folds=1, photo=0, textured=0)
     shaded, places = 0, []
     for seed in range(20):
-        sample, _ = everything(scene, 2, _generator(seed))
-        assert sample.depth is not None
+        sample, _ = everything(scene, 2, seeded(seed))
         change = (sample.depth / scene.depth - 1).abs()[0]
         assert 1e-6 < float(change.max()) < 0.2
         places.append(float((change > 0.2 * change.max()).float().mean()))
@@ -246,27 +216,14 @@ def test_folds_are_in_truth_map_and_photo_and_only_in_places() -> None:
     assert min(places) < 0.2
 
 
-def test_folds_keep_holes_and_shade_their_surroundings() -> None:
-    scene = _scene(64)
-    assert scene.depth is not None
-    depth = scene.depth.clone()
-    depth[:, 30:40, 10:20] = torch.nan
-    for seed in range(5):
-        folded = add_folds(replace(scene, depth=depth), _generator(seed))
-        assert folded.depth is not None
-        assert torch.equal(folded.depth.isnan(), depth.isnan())
-        assert bool(folded.rgb.isfinite().all())
-        assert float(folded.depth.nan_to_num(1).min()) > 0
-
-
-def test_structured_light_loses_pixels_at_steps_and_on_steep_surfaces() -> None:
+def test_structured_light_loses_pixels_at_steps_and_on_steep_surfaces():
     """Of a sphere, more at its border than in its middle, and nothing on a wall that faces the sensor."""
     v, u = torch.meshgrid(torch.linspace(-1.2, 1.2, 128), torch.linspace(-1.2, 1.2, 128), indexing="ij")
     radius = (v.square() + u.square()).sqrt()
     values = torch.where(radius < 1, 1 / (2 - (1 - radius.square()).clamp(min=0).sqrt()), 0.4)[None]
     lost = torch.zeros_like(values)
     for seed in range(60):
-        lost += NOISES["structured"](values, torch.ones_like(values), _generator(seed)).isnan()
+        lost += NOISES["structured"](values, torch.ones_like(values), seeded(seed)).isnan()
     rim, rest = (
         (radius > 0.85) & (radius < 0.95),
         (radius > 1.15) & (u > 0) | (radius < 0.3),
@@ -275,17 +232,17 @@ def test_structured_light_loses_pixels_at_steps_and_on_steep_surfaces() -> None:
     assert float(lost[0, rest].mean()) < 1
 
 
-def test_each_fact_has_a_place_of_its_own() -> None:
+def test_each_fact_has_a_place_of_its_own():
     assert not bool(encode_facts().any())
     reported = [encode_facts(kernel) for kernel in KERNELS]
     reported += [encode_facts(soft=soft) for soft in (False, True)] + [encode_facts(noise=True)]
     assert torch.equal(torch.stack(reported), torch.eye(FACTS))
     assert torch.equal(encode_facts("bicubic", soft=True, noise=True), reported[3] + reported[6] + reported[7])
-    with pytest.raises(ValueError, match=r"kernel: expected one of box, nearest, .*, got 'sinc'"):
+    with pytest.raises(ValueError, match=r"kernel: expected"):
         encode_facts("sinc")
 
 
-def test_local_noise_ignores_holes_and_outliers() -> None:
+def test_local_noise_ignores_holes_and_outliers():
     truth = (0.5 + 0.1 * (torch.arange(64, dtype=torch.float64) + 0.5) / 64).expand(1, 1, 48, 64)
     given = functional.avg_pool2d(truth, 4)
     error = 0.002 * torch.ones_like(given)

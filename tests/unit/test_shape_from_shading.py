@@ -1,20 +1,20 @@
-"""Super-resolution from shading: closed forms, dense references, derivatives, and steps that lower the energy."""
+"""Shape from shading and its regions of one colour: closed forms, dense references, exhaustive search."""
 
+import itertools
 import math
-from collections.abc import Callable
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from small_scenes import grid
 from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range
 from dsr.geometry.surface import depth_to_normals
 from dsr.methods.classical.interpolation import Interpolation
+from dsr.methods.classical.potts import Regions, boundary_length, fit_albedo, fuse
 from dsr.methods.classical.shape_from_shading import (
     ShadingSolver,
     ShapeFromShading,
@@ -23,38 +23,113 @@ from dsr.methods.classical.shape_from_shading import (
     conjugate_gradients,
     fit_lighting,
 )
-from dsr.sample import DepthSample, Scene
+from dsr.sample import Scene
+
+
+def _everywhere(rgb):
+    return torch.ones_like(rgb[:, :1], dtype=torch.bool)
+
+
+def _energy(rgb, shading, regions, weight):
+    missed = fit_albedo(rgb, shading, regions) * shading - rgb
+    return 0.5 * float(missed.square().sum()) + weight * boundary_length(regions, _everywhere(rgb))
+
+
+def _two(size=24, noise=0.03):
+    """Return a photo of a disc before a wall under uneven light, its shading, and the disc."""
+    rng = np.random.default_rng(0)
+    v, u = np.mgrid[:size, :size]
+    disc = torch.from_numpy((u - 11) ** 2 + (v - 13) ** 2 < 50)
+    albedo = torch.where(
+        disc, torch.tensor([0.8, 0.3, 0.5])[:, None, None], torch.tensor([0.4, 0.6, 0.5])[:, None, None]
+    )
+    shading = torch.from_numpy(0.5 + 0.4 * u / size + 0.1 * np.sin(v)).expand(1, 3, size, size)
+    rgb = albedo[None] * shading + noise * torch.from_numpy(rng.normal(size=(1, 3, size, size)))
+    return rgb, shading, disc
+
+
+def test_two_regions_under_noise_are_found_exactly():
+    rgb, shading, disc = _two()
+    regions = fuse(rgb, shading, 0.05, _everywhere(rgb))
+    assert regions.number == 2
+    assert torch.equal(regions.labels[0] == regions.labels[0, 13, 11], disc)
+
+
+def test_albedo_of_a_region_is_the_least_squares_one():
+    rgb, shading, disc = _two()
+    albedo = fit_albedo(rgb, shading, fuse(rgb, shading, 0.05, _everywhere(rgb)))
+    for channel in range(3):
+        for where in (disc, ~disc):
+            expected = np.linalg.lstsq(
+                shading[0, channel][where].numpy()[:, None], rgb[0, channel][where].numpy(), rcond=None
+            )[0]
+            torch.testing.assert_close(albedo[0, channel][where], torch.full((int(where.sum()),), expected[0]).double())
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("weight", [0.001, 0.02, 0.5])
+def test_partitions_that_fuse_two_regions_have_no_less_energy(seed, weight):
+    rng = np.random.default_rng(seed)
+    rgb, shading = (torch.from_numpy(rng.uniform(0.2, 1, (1, 2, 4, 5))) for _ in range(2))
+    regions = fuse(rgb, shading, weight, _everywhere(rgb))
+    least = _energy(rgb, shading, regions, weight)
+    for one, other in itertools.combinations(range(regions.number), 2):
+        labels = torch.where(regions.labels == other, one, regions.labels)
+        assert _energy(rgb, shading, Regions(labels, regions.number), weight) >= least - 1e-12
+
+
+def test_row_of_pixels_is_cut_as_by_an_exhaustive_search():
+    values = torch.tensor([0.2, 0.22, 0.21, 0.6, 0.62, 0.9, 0.88, 0.91]).double()
+    rgb = values.reshape(1, 1, 1, 8)
+    shading = torch.ones_like(rgb)
+    best = min(
+        (torch.tensor([0, *np.cumsum(cuts)]) for cuts in itertools.product((0, 1), repeat=7)),
+        key=lambda labels: _energy(rgb, shading, Regions(labels.reshape(1, 1, 8), 8), 0.02),
+    )
+    assert torch.equal(fuse(rgb, shading, 0.02, _everywhere(rgb)).labels.reshape(-1), best)
+
+
+def test_regions_of_a_batch_are_those_of_its_pictures():
+    rgb, shading, _ = _two()
+    rgb, shading = torch.cat((rgb, rgb.flip(-1))), torch.cat((shading, shading.flip(-1)))
+    together = fit_albedo(rgb, shading, fuse(rgb, shading, 0.05, _everywhere(rgb)))
+    for number in range(2):
+        one = rgb[number : number + 1], shading[number : number + 1]
+        torch.testing.assert_close(together[number], fit_albedo(*one, fuse(*one, 0.05, _everywhere(one[0])))[0])
+
+
+def test_pixels_outside_stay_alone_and_separate_the_inside():
+    rgb = torch.full((1, 1, 3, 5), 0.5).double()
+    inside = torch.ones(1, 1, 3, 5, dtype=torch.bool)
+    inside[..., 2] = False
+    regions = fuse(rgb, torch.ones_like(rgb), 0.1, inside)
+    assert regions.number == 2 + 3
+    assert boundary_length(regions, inside) == 0
+
 
 LIGHT = torch.tensor([[[0.35, -0.3, -0.55, 0.15], [0.3, -0.25, -0.5, 0.2], [0.25, -0.3, -0.5, 0.2]]]).double()
 
 
-def _camera(height: int, width: int, focal: float | None = None) -> Camera:
+def _camera(height, width, focal=None):
     focal = 1.2 * width if focal is None else focal
     return Camera(width, height, focal, 1.1 * focal, 0.45 * width, 0.55 * height)
 
 
-def _grid(height: int, width: int) -> tuple[Tensor, Tensor]:
-    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
-    return v, u
-
-
-def _sample(
-    depth: Tensor, rgb: Tensor | None = None, scale: int = 4, name: str = "hall", focal: float | None = None
-) -> DepthSample:
+def _sample(depth, rgb=None, scale=4, name="hall", focal=None):
     """Return the problem of a scene with this depth, (H, W)."""
     camera = _camera(*depth.shape, focal)
     rgb = torch.full((3, *depth.shape), 0.5) if rgb is None else rgb
     return make_sample(Scene("set", name, rgb, camera, depth[None]), scale, Downsampling("box"), "orthogonal")
 
 
-def _lit(depth: Tensor) -> Tensor:
+def _lit(depth):
     """Return the photo of a surface of one colour under LIGHT, (3, H, W)."""
     normals = depth_to_normals(depth[None, None], _camera(*depth.shape).rays()[None])
     colour = torch.tensor([0.8, 0.7, 0.6]).double()[:, None, None]
     return (colour * compute_shading(normals, LIGHT)[0]).clamp(0, 1)
 
 
-def _sphere(size: int) -> Tensor:
+def _sphere(size):
     """Return a sphere of radius 0.6 m, 2 m away, before a wall that it is half sunk into, (H, W)."""
     rays = _camera(size, size).rays()
     middle = torch.tensor([0.0, -0.05, 2.0]).double()[:, None, None]
@@ -63,26 +138,26 @@ def _sphere(size: int) -> Tensor:
     return torch.where(root > 0, (along - root.clamp(min=0).sqrt()) / square, torch.inf).clamp(max=1.8)
 
 
-def _bumps(size: int) -> Tensor:
-    v, u = _grid(size, size)
+def _bumps(size):
+    v, u = grid(size, size)
     hill = torch.exp(-((u - size / 2) ** 2 + (v - size / 2) ** 2) / (2 * (size / 5) ** 2))
     return 2 - 0.25 * hill + 0.02 * torch.sin(2 * math.pi * u / 9) * torch.sin(2 * math.pi * v / 11)
 
 
-def _angle(depth: Tensor, truth: Tensor) -> float:
+def _angle(depth, truth):
     """Return the mean angle between normals in degrees."""
     rays = _camera(*truth.shape).rays()[None]
     a, b = (depth_to_normals(each[None, None].double(), rays) for each in (depth, truth))
     return float(torch.rad2deg(torch.acos((a * b).sum(dim=1).clamp(-1, 1))).mean())
 
 
-def _random(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+def _random(height, width, seed=0):
     rng = np.random.default_rng(seed)
     rgb = torch.from_numpy(rng.uniform(0, 1, (3, height, width))).float()
     return torch.from_numpy(rng.uniform(1.8, 2.2, (height, width))), rgb
 
 
-def _solver(*, holes: bool = False, mask: bool = False) -> ShadingSolver:
+def _solver(*, holes=False, mask=False):
     """Return a solver in the midst of a random problem of 16 x 16 pixels."""
     depth, rgb = _random(16, 16)
     sample = _sample(depth, rgb)
@@ -90,7 +165,7 @@ def _solver(*, holes: bool = False, mask: bool = False) -> ShadingSolver:
         sample.depth_lr[:, 1:3, 2] = torch.nan
     solver, _ = ShapeFromShading().prepare(sample)
     if mask:
-        v, u = _grid(16, 16)
+        v, u = grid(16, 16)
         inside = ((u - 7) ** 2 + (v - 8) ** 2 < 40)[None, None]
         solver = ShadingSolver(solver.problem._replace(inside=inside), solver.z, solver.penalty)
     rng = np.random.default_rng(1)
@@ -101,7 +176,7 @@ def _solver(*, holes: bool = False, mask: bool = False) -> ShadingSolver:
     return solver
 
 
-def _dense(operator: Callable[[Tensor], Tensor], shape: tuple[int, ...]) -> np.ndarray:
+def _dense(operator, shape):
     """Return an operator's matrix, a column an input."""
     eye = torch.eye(math.prod(shape)).double().unflatten(1, shape)
     return torch.stack([operator(each[None]).flatten() for each in eye], dim=1).numpy()
@@ -110,9 +185,7 @@ def _dense(operator: Callable[[Tensor], Tensor], shape: tuple[int, ...]) -> np.n
 @pytest.mark.parametrize(
     ("build", "area_weight", "share"), [(_sphere, 0.2, 0.85), (_bumps, 0.02, 0.5)], ids=["sphere", "bumps"]
 )
-def test_normals_of_a_shaded_surface_are_better_than_those_of_bicubic(
-    build: Callable[[int], Tensor], area_weight: float, share: float
-) -> None:
+def test_normals_of_a_shaded_surface_are_better_than_those_of_bicubic(build, area_weight, share):
     truth = build(40)
     sample = _sample(truth, _lit(truth))
     bicubic = _angle(Interpolation("bicubic")(sample)[0], truth)
@@ -120,14 +193,14 @@ def test_normals_of_a_shaded_surface_are_better_than_those_of_bicubic(
 
 
 @pytest.mark.parametrize("mask", [False, True])
-def test_slopes_and_their_adjoint_have_transposed_matrices(mask: bool) -> None:
+def test_slopes_and_their_adjoint_have_transposed_matrices(mask):
     slopes = _solver(mask=mask).slopes
     back = _dense(slopes.adjoint, (3, 16, 16))
     np.testing.assert_allclose(back, _dense(slopes, (1, 16, 16)).T, atol=1e-14)
 
 
 @pytest.mark.parametrize(("holes", "mask"), [(False, False), (True, False), (False, True)])
-def test_depth_step_is_the_least_squares_solution(holes: bool, mask: bool) -> None:
+def test_depth_step_is_the_least_squares_solution(holes, mask):
     """Of sqrt(data) (K z - coarse) and sqrt(penalty) (G z - theta + u), as dense matrices by numpy."""
     solver = _solver(holes=holes, mask=mask)
     problem, before = solver.problem, solver.z.flatten().numpy().copy()
@@ -147,7 +220,7 @@ def test_depth_step_is_the_least_squares_solution(holes: bool, mask: bool) -> No
 
 
 @pytest.mark.parametrize(("holes", "mask"), [(False, False), (True, False), (False, True)])
-def test_augmented_lagrangian_is_raised_by_no_step_in_its_own_variable(holes: bool, mask: bool) -> None:
+def test_augmented_lagrangian_is_raised_by_no_step_in_its_own_variable(holes, mask):
     solver = _solver(holes=holes, mask=mask)
     steps = (solver.update_albedo, solver.update_lighting, solver.update_theta, solver.update_depth)
     lowered = dict.fromkeys(steps, 0.0)
@@ -162,14 +235,14 @@ def test_augmented_lagrangian_is_raised_by_no_step_in_its_own_variable(holes: bo
     assert min(lowered.values()) > 0
 
 
-def _lagrangian(solver: ShadingSolver) -> float:
+def _lagrangian(solver):
     miss = solver.slopes(solver.z) + solver.missed - solver.theta
     bound = 0.5 * solver.penalty * float((solver.coupling * (miss.square() - solver.missed.square())).sum())
     return sum(solver.terms(solver.theta).values()) + bound
 
 
 @pytest.mark.parametrize("mask", [False, True])
-def test_gradient_in_theta_is_that_of_the_energy_and_vanishes_after_some_steps(mask: bool) -> None:
+def test_gradient_in_theta_is_that_of_the_energy_and_vanishes_after_some_steps(mask):
     solver = _solver(mask=mask)
     target = solver.slopes(solver.z) + solver.missed
     first, hessian = solver.expand_energy(solver.theta, target)
@@ -182,34 +255,19 @@ def test_gradient_in_theta_is_that_of_the_energy_and_vanishes_after_some_steps(m
     assert float(last.square().mean()) < 1e-3 * float(first.square().mean())
 
 
-def test_level_plane_of_one_colour_is_reproduced_to_a_thousandth_of_its_depth() -> None:
-    """Not exactly: the area that a pixel sees is least on a sphere around the camera."""
-    sample = _sample(torch.full((16, 24), 3.0).double(), focal=400.0)
-    assert float((ShapeFromShading()(sample) / 3 - 1).abs().max()) < 1e-3
-
-
-@pytest.mark.parametrize("scale", [2, 4, 8])
-def test_slanted_plane_of_one_colour_is_reproduced_to_a_hundredth_of_its_depth(scale: int) -> None:
-    v, u = _grid(32, 48)
-    camera = _camera(32, 48, 400.0)
-    truth = from_range((40 + 0.05 * u - 0.03 * v)[None], camera, "disparity")[0]
+@pytest.mark.parametrize(("scale", "holes"), [(2, False), (4, True), (8, False)])
+def test_slanted_plane_of_one_colour_is_reproduced_to_a_hundredth_of_its_depth(scale, holes):
+    v, u = grid(32, 48)
+    truth = from_range((40 + 0.05 * u - 0.03 * v)[None], _camera(32, 48, 400.0), "disparity")[0]
     sample = _sample(truth, None, scale, focal=400.0)
+    if holes:
+        sample.depth_lr[:, 3:5, 4:6] = torch.nan
     fine = ShapeFromShading(iterations=10)(sample)[0]
     assert float((fine / truth - 1).abs().max()) < 1e-2
     assert float((fine / truth - 1).square().mean().sqrt()) < 1e-3
 
 
-def test_holes_are_filled_and_have_no_influence() -> None:
-    depth, rgb = _random(16, 24)
-    sample = _sample(depth, rgb)
-    sample.depth_lr[:, 1:3, 2:4] = torch.nan
-    fine = ShapeFromShading(iterations=5)(sample)
-    assert fine.shape == (1, 16, 24)
-    assert bool(fine.isfinite().all())
-    assert float(fine.min()) > 1.0
-
-
-def test_batch_equals_its_problems_one_at_a_time() -> None:
+def test_batch_equals_its_problems_one_at_a_time():
     solvers = [ShapeFromShading().prepare(_sample(*_random(16, 16, seed)))[0] for seed in (0, 1)]
     one, other = (solver.problem for solver in solvers)
     joined = {name: torch.cat((getattr(one, name), getattr(other, name))) for name in ("rgb", "lr", "inside")}
@@ -223,27 +281,23 @@ def test_batch_equals_its_problems_one_at_a_time() -> None:
     torch.testing.assert_close(together.z, torch.cat([solver.z for solver in solvers]), rtol=1e-5, atol=0)
 
 
-def test_iteration_stops_at_convergence_and_reports_progress() -> None:
-    reported: list[tuple[int, int]] = []
-    truth = _sphere(32)
+def test_iteration_stops_at_convergence_and_reports_progress():
+    reported, truth = [], _sphere(32)
     method = ShapeFromShading(iterations=60, tolerance=3e-3)
-    method(_sample(truth, _lit(truth)), lambda done, most: reported.append((done, most)))
-    steps = len(method.history)
+    method(_sample(truth, _lit(truth)), lambda *now: reported.append(now))
+    steps, last, before = len(method.history), method.history[-1], method.history[-2]
     assert 2 < steps < 60
     assert reported == [*((done, 60) for done in range(1, steps + 1)), (60, 60)]
-    assert [entry["iteration"] for entry in method.history] == list(range(1, steps + 1))
-    last, before = method.history[-1], method.history[-2]
     assert last["residual"] < 3e-3
     assert abs(last["objective"] - before["objective"]) < 3e-3 * before["objective"]
-    terms = ("shading", "data", "area", "boundaries")
-    assert last["objective"] == pytest.approx(sum(last[name] for name in terms))
+    assert last["objective"] == pytest.approx(sum(last[name] for name in ("shading", "data", "area", "boundaries")))
     assert last["objective"] < method.history[0]["objective"]
 
 
-def test_background_keeps_the_initial_map(tmp_path: Path) -> None:
+def test_background_keeps_the_initial_map(tmp_path):
     truth = _bumps(32)
     sample = _sample(truth, _lit(truth), name="bumps")
-    v, u = _grid(32, 32)
+    v, u = grid(32, 32)
     inside = (u - 15) ** 2 + (v - 17) ** 2 < 90
     cv2.imwrite(str(tmp_path / "bumps.png"), 255 * inside.numpy().astype(np.uint8))
     method = ShapeFromShading(iterations=5, foreground=str(tmp_path))
@@ -255,37 +309,17 @@ def test_background_keeps_the_initial_map(tmp_path: Path) -> None:
     assert float((fine - truth)[inside].square().mean()) < float((first - truth)[inside].square().mean())
 
 
-def test_missing_damaged_empty_or_misfitting_mask_is_refused_by_name(tmp_path: Path) -> None:
-    sample = _sample(_bumps(16))
-    path = tmp_path / "hall.png"
-    method = ShapeFromShading(iterations=1, foreground=str(tmp_path))
-    with pytest.raises(ValueError, match=r"hall\.png: expected a mask of the foreground, there is no such file"):
-        method(sample)
-    for content in (b"", b"no picture"):
-        path.write_bytes(content)
-        with pytest.raises(ValueError, match=r"hall\.png: .* no picture or damaged"):
-            method(sample)
-    cv2.imwrite(str(path), np.full((16, 20), 255, np.uint8))
-    with pytest.raises(ValueError, match=r"hall\.png: expected 16 x 16, as the photo is, got 16 x 20"):
-        method(sample)
-    cv2.imwrite(str(path), np.zeros((16, 16), np.uint8))
-    with pytest.raises(ValueError, match=r"hall\.png: expected a foreground in white, got a black mask"):
-        method(sample)
+def test_missing_damaged_empty_or_misfitting_mask_is_refused_by_name(tmp_path):
+    path, method = tmp_path / "hall.png", ShapeFromShading(iterations=1, foreground=str(tmp_path))
+    wide, black = (cv2.imencode(".png", np.full((16, n), 255 * (n > 16), np.uint8))[1].tobytes() for n in (20, 16))
+    for content, message in ((None, "no such file"), (b"no picture", "damaged"), (wide, "16 x 20"), (black, "black")):
+        if content is not None:
+            path.write_bytes(content)
+        with pytest.raises(ValueError, match=rf"hall\.png: .*{message}"):
+            method(_sample(_bumps(16)))
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("iterations", 0), ("tolerance", -1.0), ("data_weight", 0.0), ("area_weight", -1.0), ("boundary_weight", 0.0),
-        ("penalty", 0.0), ("growth", 0.9), ("foreground", "/nowhere"),
-    ],
-)  # fmt: skip
-def test_value_out_of_range_is_refused_by_name(key: str, value: object) -> None:
-    with pytest.raises(ValueError, match=rf"^{key}: expected .* {value}"):
-        ShapeFromShading(**{key: value})  # type: ignore[arg-type]
-
-
-def test_rendering_converges_to_that_of_the_geometrys_normals() -> None:
+def test_rendering_converges_to_that_of_the_geometrys_normals():
     errors = []
     for size in (64, 128):
         theta, depth, rays = _smooth_theta(size)
@@ -295,7 +329,7 @@ def test_rendering_converges_to_that_of_the_geometrys_normals() -> None:
     assert errors[1] == pytest.approx(errors[0] / 2, rel=0.1)  # of differences taken to one side
 
 
-def test_area_is_that_of_the_back_projected_pixels() -> None:
+def test_area_is_that_of_the_back_projected_pixels():
     theta, depth, rays = _smooth_theta(256)
     points, camera = (depth * rays)[0], _camera(256, 256)
     along_u, along_v = points.diff(dim=2)[:, :-1], points.diff(dim=1)[:, :, :-1]
@@ -305,7 +339,7 @@ def test_area_is_that_of_the_back_projected_pixels() -> None:
     assert float(ours.sum()) == pytest.approx(float(expected.sum()), rel=2e-3)
 
 
-def _smooth_theta(size: int) -> tuple[Tensor, Tensor, Tensor]:
+def _smooth_theta(size):
     """Return a smooth surface's slopes and depth, (1, 3, H, W), from forward differences, its depth, and the rays."""
     camera = _camera(size, size)
     rays = camera.rays()
@@ -317,7 +351,7 @@ def _smooth_theta(size: int) -> tuple[Tensor, Tensor, Tensor]:
     return torch.stack((*slopes, depth))[None], depth[None, None], rays[None]
 
 
-def test_light_is_recovered_exactly_from_a_photo_without_noise() -> None:
+def test_light_is_recovered_exactly_from_a_photo_without_noise():
     rng = np.random.default_rng(0)
     normals = functional.normalize(torch.from_numpy(rng.normal(size=(1, 3, 3, 4))), dim=1)
     albedo = torch.from_numpy(rng.uniform(0.1, 1, (1, 3, 3, 4)))
@@ -329,14 +363,14 @@ def test_light_is_recovered_exactly_from_a_photo_without_noise() -> None:
     torch.testing.assert_close(fit_lighting(rgb, albedo, normals, inside), LIGHT)
 
 
-def test_light_on_a_flat_wall_is_the_smallest_that_explains_it() -> None:
+def test_light_on_a_flat_wall_is_the_smallest_that_explains_it():
     normals = torch.tensor([0.0, 0.0, -1.0]).double()[:, None, None].expand(1, 3, 4, 5)
     albedo = torch.ones(1, 1, 4, 5).double()
     light = fit_lighting(0.6 * albedo, albedo, normals, torch.ones_like(albedo))
     torch.testing.assert_close(light, torch.tensor([[[0.0, 0.0, -0.3, 0.3]]]).double())
 
 
-def test_conjugate_gradients_solve_each_element_of_a_batch_and_leave_a_solved_one_unchanged() -> None:
+def test_conjugate_gradients_solve_each_element_of_a_batch_and_leave_a_solved_one_unchanged():
     rng = np.random.default_rng(0)
     root = torch.from_numpy(rng.normal(size=(3, 12, 12)))
     matrices, right = root @ root.mT + torch.eye(12).double(), torch.from_numpy(rng.normal(size=(3, 12)))
@@ -344,9 +378,3 @@ def test_conjugate_gradients_solve_each_element_of_a_batch_and_leave_a_solved_on
     found = conjugate_gradients(lambda x: (matrices @ x[..., None])[..., 0], right, 100, 1e-12)
     torch.testing.assert_close(found[1:], torch.linalg.solve(matrices[1:], right[1:]))
     assert torch.equal(found[0], torch.zeros(12).double())
-
-
-def test_conjugate_gradients_need_at_most_one_step_per_distinct_eigenvalue() -> None:
-    diagonal = torch.tensor([1.0, 1, 4, 4, 9, 9]).double()
-    right = torch.arange(1.0, 7.0).double()[None]
-    torch.testing.assert_close(conjugate_gradients(lambda x: diagonal * x, right, 3, 0.0), right / diagonal)

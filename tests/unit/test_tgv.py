@@ -1,19 +1,14 @@
 """TGV upsampling, against another algorithm for the same minimum, and closed forms."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import torch
 from scipy import sparse
 from scipy.sparse.linalg import splu
 from small_scenes import disparity_of, plane, random_scene, sample_of, step
-from torch import Tensor
 
 from dsr.geometry.camera import to_range
 from dsr.methods.classical.tgv import (
-    Solution,
-    Tensors,
     TotalGeneralisedVariation,
     divergence,
     gradient,
@@ -22,23 +17,23 @@ from dsr.methods.classical.tgv import (
 from dsr.methods.images import extend_linearly, upsample_linear_border
 
 
-def _normals(*shape: int, seed: int = 0) -> Tensor:
+def _normals(*shape, seed=0):
     return torch.from_numpy(np.random.default_rng(seed).normal(size=shape))
 
 
-def _means(x: Tensor, scale: int) -> np.ndarray:
+def _means(x, scale):
     height, width = x.shape
     return x.numpy().reshape(height // scale, scale, width // scale, scale).mean(axis=(1, 3))
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 5, 7), (2, 2, 4, 3), (1, 1, 1, 6), (1, 2, 3, 1)])
-def test_divergence_is_minus_the_adjoint_of_the_gradient(shape: tuple[int, int, int, int]) -> None:
+def test_divergence_is_minus_the_adjoint_of_the_gradient(shape):
     batch, channels, height, width = shape
     x, p = _normals(*shape), _normals(batch, 2, channels, height, width, seed=1)
     assert float((gradient(x) * p).sum()) == pytest.approx(-float((x * divergence(p)).sum()), rel=1e-12)
 
 
-def test_preconditioner_is_the_absolute_column_sum_of_the_gradients() -> None:
+def test_preconditioner_is_the_absolute_column_sum_of_the_gradients():
     sizes = _normals(1, 2, 1, 4, 5).abs()
     eye = torch.eye(20).double().reshape(20, 1, 4, 5)
     expected = (gradient(eye).abs() * sizes).sum(dim=(1, 2, 3, 4)).reshape(4, 5)
@@ -46,23 +41,14 @@ def test_preconditioner_is_the_absolute_column_sum_of_the_gradients() -> None:
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8])
-def test_upsampling_and_extending_reproduce_a_plane_up_to_the_border(scale: int) -> None:
+def test_upsampling_and_extending_reproduce_a_plane_up_to_the_border(scale):
     flat = plane()
     coarse = torch.from_numpy(_means(flat, scale))[None, None]
     torch.testing.assert_close(upsample_linear_border(coarse, scale)[0, 0], flat)
     torch.testing.assert_close(extend_linearly(flat[None, None, 3:-3, 3:-3], 3)[0, 0], flat)
 
 
-def test_tensor_shrinks_across_an_edge_and_keeps_the_direction_along_it() -> None:
-    _, rgb = step(16, 8)
-    g = TotalGeneralisedVariation(sharpness=9.0, exponent=0.85).diffusion_tensors(rgb[None].double())
-    assert float(g.uu[0, 0, 5, 7]) == pytest.approx(np.exp(-9.0), abs=1e-6)
-    assert torch.equal(g.vv, torch.ones_like(g.vv))
-    assert torch.equal(g.uv, torch.zeros_like(g.uv))
-    assert float(g.uu.sum()) == pytest.approx(16 * 15 + 16 * np.exp(-9.0), abs=1e-4)
-
-
-def test_tensor_root_has_the_eigenvalues_of_the_paper() -> None:
+def test_tensor_root_has_the_eigenvalues_of_the_paper():
     _, rgb = random_scene(6, 7)
     g = TotalGeneralisedVariation(sharpness=3.0, exponent=0.5).diffusion_tensors(rgb[None].double())
     matrices = torch.stack((g.uu, g.uv, g.uv, g.vv), dim=-1).reshape(-1, 2, 2)
@@ -75,7 +61,7 @@ def test_tensor_root_has_the_eigenvalues_of_the_paper() -> None:
 
 
 @pytest.mark.parametrize(("data_weight", "holes"), [(None, True), (20.0, False)])
-def test_objective_reaches_that_of_another_algorithm(data_weight: float | None, holes: bool) -> None:
+def test_objective_reaches_that_of_another_algorithm(data_weight, holes):
     """Within 1e-3, on 16 x 16 pixels with depth steps, slopes and noise: ADMM with exact solves."""
     rng = np.random.default_rng(3)
     truth = np.where(np.arange(16) > 6, 0.8, 0.2) + 0.02 * np.arange(16)[:, None] + rng.normal(0, 0.03, (16, 16))
@@ -92,9 +78,7 @@ def test_objective_reaches_that_of_another_algorithm(data_weight: float | None, 
     assert energy(method.minimise(rgb, coarse, 2)) > 1.01 * ours
 
 
-def _reference(
-    coarse: np.ndarray, g: Tensors, first: float, second: float, weight: float | None
-) -> tuple[float, Callable[[Solution], float]]:
+def _reference(coarse, g, first, second, weight):
     """Return the least E for 2 x 2 blocks, and E: the alternating direction method of multipliers, sparse matrices."""
     height, width = (2 * n for n in coarse.shape)
     size = height * width
@@ -122,7 +106,7 @@ def _reference(
         )
         w = y - z
 
-    def energy(x: np.ndarray) -> float:
+    def energy(x):
         y = k @ x
         lengths = [
             np.linalg.norm(part.reshape(n, -1), axis=0).sum() for part, n in ((y[: 2 * size], 2), (y[2 * size :], 4))
@@ -132,27 +116,18 @@ def _reference(
     return energy(x), lambda found: energy(torch.cat((found.values, found.slopes), dim=1).numpy().ravel())
 
 
-def _difference(count: int) -> sparse.spmatrix:
+def _difference(count):
     matrix = sparse.diags([-np.ones(count), np.ones(count - 1)], [0, 1]).tolil()
     matrix[-1] = 0
     return matrix.tocsr()
 
 
-def _shrunk(y: np.ndarray, by: float) -> np.ndarray:
+def _shrunk(y, by):
     lengths = np.linalg.norm(y, axis=0)
     return (y * np.maximum(1 - by / np.maximum(lengths, 1e-300), 0)).ravel()
 
 
-@pytest.mark.parametrize("scale", [2, 4, 8])
-def test_tgv_reproduces_a_plane_exactly(scale: int) -> None:
-    disparity = plane()
-    sample = sample_of(disparity, random_scene(32, 48)[1], scale)
-    fine = TotalGeneralisedVariation(iterations=300)(sample)
-    assert fine.shape == (1, 32, 48)
-    torch.testing.assert_close(disparity_of(fine, sample), disparity, rtol=0, atol=1e-9)
-
-
-def test_tgv_fills_a_hole_in_a_plane_with_the_plane() -> None:
+def test_tgv_fills_a_hole_in_a_plane_with_the_plane():
     disparity = plane()
     sample = sample_of(disparity)
     sample.depth_lr[:, 2:5, 4:7] = torch.nan
@@ -160,7 +135,7 @@ def test_tgv_fills_a_hole_in_a_plane_with_the_plane() -> None:
     assert (fine - disparity).abs().max() < 1e-3 * (disparity.max() - disparity.min())
 
 
-def test_step_stays_sharp_along_a_photo_edge_and_is_smoother_without_one() -> None:
+def test_step_stays_sharp_along_a_photo_edge_and_is_smoother_without_one():
     disparity, rgb = step()
     sharp, smooth = (
         disparity_of(TotalGeneralisedVariation(iterations=600)(sample), sample)
@@ -171,37 +146,27 @@ def test_step_stays_sharp_along_a_photo_edge_and_is_smoother_without_one() -> No
 
 
 @pytest.mark.parametrize(("scale", "size"), [(2, (10, 6)), (8, (8, 24)), (16, (16, 16))])
-def test_block_means_are_the_input_without_a_data_weight(scale: int, size: tuple[int, int]) -> None:
+def test_block_means_are_the_input_without_a_data_weight(scale, size):
     sample = sample_of(*random_scene(*size), scale=scale)
     fine = disparity_of(TotalGeneralisedVariation(iterations=60)(sample), sample)
     coarse = to_range(sample.depth_lr, sample.camera_lr, "disparity")[0].numpy() * scale
     np.testing.assert_allclose(_means(fine, scale), coarse, rtol=1e-9)
 
 
-def test_small_data_weight_smooths_a_noisy_plane() -> None:
-    noisy = plane() + 0.1 * _normals(32, 48)
-    sample = sample_of(noisy, scale=2)
-    errors = [
-        float((disparity_of(TotalGeneralisedVariation(data_weight=weight)(sample), sample) - plane()).square().mean())
-        for weight in (None, 2.0)
-    ]
-    assert errors[1] < 0.5 * errors[0]
-
-
-def test_automatic_weight_smooths_a_noisy_plane_and_reproduces_a_clean_one() -> None:
+def test_automatic_weight_smooths_a_noisy_plane_and_reproduces_a_clean_one():
     flat = plane()
     means = torch.from_numpy(_means(flat, 4))
     noisy = means + 0.02 * (means.max() - means.min()) * _normals(*means.shape)
     errors = []
     for weight in (None, "auto"):
-        tgv = TotalGeneralisedVariation(iterations=300, data_weight=weight)  # type: ignore[arg-type]
+        tgv = TotalGeneralisedVariation(iterations=300, data_weight=weight)
         errors.append(float((_upsampled(tgv, noisy) - flat).square().mean().sqrt()))
     assert errors[1] < 0.5 * errors[0]
     exact = TotalGeneralisedVariation(iterations=300, data_weight="auto")
     np.testing.assert_allclose(_means(_upsampled(exact, means), 4), means, atol=1e-6)
 
 
-def _upsampled(tgv: TotalGeneralisedVariation, lr: Tensor) -> Tensor:
+def _upsampled(tgv, lr):
     """Return the map of a grey photo that fits a low-resolution one."""
     height, width = lr.shape
     low, size = lr.min(), lr.max() - lr.min()
@@ -209,7 +174,7 @@ def _upsampled(tgv: TotalGeneralisedVariation, lr: Tensor) -> Tensor:
     return tgv.minimise(rgb, ((lr - low) / size)[None, None], 4).values[0, 0] * size + low
 
 
-def test_batch_equals_its_samples_one_at_a_time() -> None:
+def test_batch_equals_its_samples_one_at_a_time():
     coarse, photos = _normals(2, 1, 4, 6).sigmoid(), _normals(2, 3, 16, 24, seed=1).sigmoid()
     method = TotalGeneralisedVariation(iterations=100, tolerance=0.0)
     together = method.minimise(photos, coarse, 4).values
@@ -218,8 +183,8 @@ def test_batch_equals_its_samples_one_at_a_time() -> None:
         torch.testing.assert_close(together[number], alone)
 
 
-def test_iteration_stops_at_convergence_and_reports_progress() -> None:
-    reported: list[tuple[int, int]] = []
+def test_iteration_stops_at_convergence_and_reports_progress():
+    reported = []
     sample = sample_of(plane())
     TotalGeneralisedVariation(iterations=5000)(sample, lambda done, most: reported.append((done, most)))
     assert reported == [(50, 5000), (5000, 5000)]
@@ -227,15 +192,3 @@ def test_iteration_stops_at_convergence_and_reports_progress() -> None:
     found = TotalGeneralisedVariation(iterations=5000, tolerance=2e-3).minimise(photo, coarse, 4)
     assert 50 * len(found.moved) == found.iterations < 5000
     assert found.moved[-1] < 2e-3 <= min(found.moved[:-1])
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("iterations", 0), ("tolerance", -1.0), ("first", 0.0), ("second", 0.0), ("data_weight", 0.0),
-        ("sharpness", -1.0), ("exponent", 0.0), ("step_ratio", 0.0),
-    ],
-)  # fmt: skip
-def test_value_out_of_range_is_refused_by_name(key: str, value: float) -> None:
-    with pytest.raises(ValueError, match=rf"^{key}: expected .*, got {value}"):
-        TotalGeneralisedVariation(**{key: value})  # type: ignore[arg-type]

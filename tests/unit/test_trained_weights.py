@@ -1,19 +1,18 @@
-"""Files of our own networks' weights: what they give back, and what is refused."""
+"""Files of weights, ours and their authors': what they give back, and what is refused without running it."""
 
 import json
-from pathlib import Path
-from typing import Any
+import pickle
 
+import numpy as np
 import pytest
 import torch
+from bombs import Trap
 from safetensors.torch import save_file
-from torch import Tensor
 
 from dsr.methods.networks.facets import Facets
 from dsr.methods.networks.msg_net import MSGNet
-from dsr.methods.networks.network import DisparityNetwork
 from dsr.methods.networks.sparse_to_dense import SparseToDense
-from dsr.methods.networks.trained import NETWORKS, TrainedNetwork
+from dsr.methods.networks.trained import NETWORKS, TrainedNetwork, load_msg_weights
 from dsr.methods.networks.weight_files import is_dsr_weights, load_network, read_header, save_network
 from dsr.methods.weights import packaged_names, packaged_weights
 
@@ -27,9 +26,9 @@ NETS = {
 
 
 @pytest.mark.parametrize("case", NETS)
-def test_file_restores_the_saved_network(tmp_path: Path, case: str) -> None:
+def test_file_restores_the_saved_network(tmp_path, case):
     net = NETS[case]()
-    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # as training has it
+    net.to(memory_format=torch.channels_last)  # as training has it
     save_network(tmp_path / "w.safetensors", net, "mine")
     before = torch.get_rng_state()
     loaded = load_network(tmp_path / "w.safetensors", NETWORKS, net.scale, "mine").train(net.training)
@@ -42,7 +41,7 @@ def test_file_restores_the_saved_network(tmp_path: Path, case: str) -> None:
         torch.testing.assert_close(loaded.upsample(rgb, disparity), net.upsample(rgb, disparity), rtol=1e-4, atol=1e-5)
 
 
-def test_half_precision_halves_the_kernels_and_is_loaded_as_float32(tmp_path: Path) -> None:
+def test_half_precision_halves_the_kernels_and_is_loaded_as_float32(tmp_path):
     net = SparseToDense(4, width=16).eval()
     save_network(tmp_path / "whole", net, "mine")
     save_network(tmp_path / "half", net, "mine", half=True)
@@ -54,7 +53,7 @@ def test_half_precision_halves_the_kernels_and_is_loaded_as_float32(tmp_path: Pa
         assert torch.equal(loaded[name], expected), name
 
 
-def test_equal_networks_give_equal_bytes_and_the_facts_are_restored(tmp_path: Path) -> None:
+def test_equal_networks_give_equal_bytes_and_the_facts_are_restored(tmp_path):
     net, facts = MSGNet(4, "dsr"), {"steps": 12, "loss": "lap1", "nested": {"b": 1, "a": [2]}}
     for name in ("a", "b"):
         save_network(tmp_path / name, net, "msg_v", facts)
@@ -64,7 +63,7 @@ def test_equal_networks_give_equal_bytes_and_the_facts_are_restored(tmp_path: Pa
     assert (head["network"], head["model"], head["arguments"]) == ("MSGNet", "msg_v", {"scale": 4, "variant": "dsr"})
 
 
-def test_file_is_distinguished_from_a_published_one_by_its_content(tmp_path: Path) -> None:
+def test_file_is_distinguished_from_a_published_one_by_its_content(tmp_path):
     save_network(tmp_path / "w.pth", MSGNet(4, "dsr"), "msg_v")
     torch.save({"model_state_dict": {}}, tmp_path / "w.caffemodel")
     assert is_dsr_weights(tmp_path / "w.pth")
@@ -74,87 +73,198 @@ def test_file_is_distinguished_from_a_published_one_by_its_content(tmp_path: Pat
         TrainedNetwork(tmp_path / "w.caffemodel", 4, "msg_v", "voynov")
 
 
-def test_trained_networks_default_to_averaging_over_quarter_turns(tmp_path: Path) -> None:
-    save_network(tmp_path / "w", MSGNet(2, "dsr"), "msg_v")
-    assert TrainedNetwork(tmp_path / "w", 2, "msg_v", "voynov").ensemble == 4
-    assert TrainedNetwork(tmp_path / "w", 2, "msg_v", "voynov", ensemble=1).ensemble == 1
+def test_trained_networks_default_to_averaging_over_quarter_turns_and_published_ones_to_none(tmp_path):
+    save_network(tmp_path / "w", MSGNet(4, "dsr"), "msg_v")
+    _published(tmp_path / "net.pth")
+    for path, default in ((tmp_path / "w", 4), (tmp_path / "net.pth", 1)):
+        assert TrainedNetwork(path, 4, "msg_v", "voynov").ensemble == default
+        assert TrainedNetwork(path, 4, "msg_v", "voynov", ensemble=8).ensemble == 8
 
 
-def _file(path: Path, changes: dict[str, Any] | None = None, tensors: dict[str, Tensor] | None = None) -> Path:
+def _file(path, tensors=None, **changes):
     """Write a file like ours with some facts other, and perhaps other tensors."""
     head = {"format": "dsr-network-1", "network": "MSGNet", "arguments": {"scale": 4, "variant": "dsr"}}
-    head |= {"model": "msg_v", "facts": {}, **(changes or {})}
+    head |= {"model": "msg_v", "facts": {}, **changes}
     state = MSGNet(4, "dsr").state_dict() if tensors is None else tensors
     save_file(dict(state), path, {"dsr": json.dumps(head)})
     return path
 
 
-def _refusal(path: Path, scale: int | None = 4, model: str | None = None) -> str:
-    """Return the message with which the file is refused: one line that names it."""
+def _author_state(state):
+    """Return parameters under Voynov et al.'s names at x4, which the network's description lists."""
+    parts = {"guidance": "feature_extraction_Y", "stem": "feature_extraction_X"}
+    up = ("levels.0.up", "levels.0.fuse", "levels.0.refine", "levels.1.up", "levels.1.fuse", "levels.1.refine")
+    parts |= {part: f"upsampling_X.{number}" for number, part in enumerate((*up, "smooth", "reconstruct"))}
+    found = {}
+    for name, value in state.items():
+        part = next((part for part in parts if name.startswith(part)), None)
+        found[name if part is None else parts[part] + name.removeprefix(part)] = value
+    return found
+
+
+def _published(path, state=None):
+    """Write a file like Voynov et al.'s."""
+    torch.save({"model_state_dict": _author_state(MSGNet(4).state_dict() if state is None else state)}, path)
+    return path
+
+
+def _load(path, scale=4, model=None):
+    return load_network(path, NETWORKS, scale, model)
+
+
+def _refusal(path, load=_load, *arguments):
+    """Return the message with which a file is refused, without its name: one line that begins with it."""
     with pytest.raises(ValueError, match=r"expected|weights are for") as caught:
-        load_network(path, NETWORKS, scale, model)
+        load(path, *arguments)
     message = str(caught.value)
     assert message.startswith(f"{path}: ")
     assert "\n" not in message
     return message.removeprefix(f"{path}: ")
 
 
-def test_missing_file_and_weights_of_another_model_or_scale_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"nowhere: no such weights file"):
-        load_network(tmp_path / "nowhere", NETWORKS)
+def test_weights_of_another_model_are_refused(tmp_path):
     path = _file(tmp_path / "w")
-    assert _refusal(path, model="msg") == "expected weights of model msg, got those of msg_v"
-    assert _refusal(path, 8) == "weights are for scale 4, the run is at scale 8"
+    assert _refusal(path, _load, 4, "msg") == "expected weights of model msg, got those of msg_v"
     with pytest.raises(ValueError, match=r"expected weights of model facets, got those of msg_v"):
         TrainedNetwork(path, 4, "facets")
 
 
-def test_file_truncated_or_changed_anywhere_is_refused(tmp_path: Path) -> None:
-    path = _file(tmp_path / "w")
-    whole = path.read_bytes()
+@pytest.mark.parametrize(
+    ("write", "load", "variant"), [(_file, _load, "dsr"), (_published, load_msg_weights, "voynov")]
+)
+def test_missing_files_other_scales_and_other_tensors_are_refused_by_name(tmp_path, write, load, variant):
+    with pytest.raises(FileNotFoundError, match=r"nowhere: no such weights file"):
+        load(tmp_path / "nowhere", 4)
+    path, state = tmp_path / "w.pth", dict(MSGNet(4, variant).state_dict())
+    assert _refusal(write(path, state), load, 8) == "weights are for scale 4, the run is at scale 8"
+    name = "smooth.conv.bias"
+    bias = state.pop(name)
+    for change, message in (
+        ({}, f"{name} is missing"),
+        ({name: bias, "extra": bias.clone()}, "'extra' is unexpected"),
+        ({name: bias[:3].clone()}, f"{name} has shape (3,) instead of (32,)"),
+        ({name: torch.full_like(bias, torch.nan)}, f"{name} holds values other than finite"),
+    ):
+        assert message in _refusal(write(path, {**state, **change}), load, 4)
+
+
+def test_file_truncated_or_changed_anywhere_is_refused(tmp_path):
+    whole = _file(tmp_path / "w").read_bytes()
     header = 8 + int.from_bytes(whole[:8], "little")
     damaged = [whole[:length] for length in (9, 100, header - 1, header, header + 1000, len(whole) - 1)]
-    damaged += [
-        first + whole[8:] for first in (b"\xff" * 8, (2**40).to_bytes(8, "little"), (header - 20).to_bytes(8, "little"))
-    ]
+    damaged += [size.to_bytes(8, "little") + whole[8:] for size in (2**64 - 1, 2**40, header - 20)]
     for content in damaged:
-        path.write_bytes(content)
-        assert "expected a safetensors file, got a damaged one" in _refusal(path)
+        assert "expected a safetensors file, got a damaged one" in _refusal(_write(tmp_path / "w", content))
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"format": "other"}, "expected weights that train.py wrote"),
-        ({"format": None}, "expected weights that train.py wrote"),
-        ({"network": "UNet"}, "expected one of the networks MSGNet, "),
-        ({"arguments": {"scale": 3}}, "expected one of the networks MSGNet, "),
-        ({"arguments": {"scale": 4, "depth": 9}}, "expected one of the networks MSGNet, "),
-        ({"arguments": [4]}, "expected one of the networks MSGNet, "),
-    ],
+    "changes",
+    [{"network": "UNet"}, {"arguments": {"scale": 3}}, {"arguments": {"scale": 4, "depth": 9}}, {"arguments": [4]}],
 )
-def test_foreign_header_is_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
-    assert _refusal(_file(tmp_path / "w", changes)).startswith(message)
+def test_foreign_header_is_refused(tmp_path, changes):
+    assert _refusal(_file(tmp_path / "w", **changes)).startswith("expected one of the networks MSGNet, ")
+    for kind in ("other", None):
+        assert _refusal(_file(tmp_path / "w", format=kind)).startswith("expected weights that train.py wrote")
     save_file({"a": torch.ones(2)}, tmp_path / "w")
     assert _refusal(tmp_path / "w").startswith("expected weights that train.py wrote")
 
 
-def test_other_tensors_are_refused(tmp_path: Path) -> None:
-    state = {**MSGNet(4, "dsr").state_dict()}
-    bias = state.pop("smooth.conv.bias")
-    assert "but smooth.conv.bias is missing" in _refusal(_file(tmp_path / "w", tensors=state))
-    extra = {**state, "smooth.conv.bias": bias, "extra": bias.clone()}
-    assert "but 'extra' is unexpected" in _refusal(_file(tmp_path / "w", tensors=extra))
-    state["smooth.conv.bias"] = torch.full_like(bias, torch.nan)
-    assert "smooth.conv.bias holds values other than finite" in _refusal(_file(tmp_path / "w", tensors=state))
-
-
-def test_packaged_files_load_as_the_model_and_scale_of_their_names() -> None:
+def test_packaged_files_load_as_the_model_and_scale_of_their_names():
     for name in packaged_names():
         path = packaged_weights(name)
-        assert path is not None
         model, _, rest = name.partition("_x")
-        net: DisparityNetwork = load_network(path, NETWORKS, int(rest.split("_")[0]), model)
+        net = load_network(path, NETWORKS, int(rest.split("_")[0]), model)
         assert net.covers
         assert read_header(path)["facts"]["steps"] > 0
     assert packaged_weights("msg_v_x3") is None
+
+
+def _varint(value):
+    head = b""
+    while value > 0x7F:
+        head += bytes([value & 0x7F | 0x80])
+        value >>= 7
+    return head + bytes([value])
+
+
+def _field(number, content):
+    return _varint(number << 3 | 2) + _varint(len(content)) + content
+
+
+def _blob(values, *, packed):
+    """Return a BlobProto; numbers one after the other, or each with its own key as proto2 writes them by default."""
+    floats, sizes = values.numpy().astype("<f4").tobytes(), values.shape
+    if packed:
+        return _field(7, _field(1, b"".join(map(_varint, sizes)))) + _field(5, floats)
+    singly = b"".join(_varint(5 << 3 | 5) + floats[i : i + 4] for i in range(0, len(floats), 4))
+    return singly + _field(7, b"".join(_varint(1 << 3) + _varint(size) for size in sizes))
+
+
+def _caffe_layers(net):
+    """Return the network's layers as Caffe keeps them: a convolution with two blobs, then a PReLU with one."""
+    layers = []
+    for name, value in net.state_dict().items():
+        layer, part = name.rsplit(".", 1)
+        kind = "PReLU" if "activation" in name else "Deconvolution" if ".up." in name else "Convolution"
+        if part == "bias":
+            layers[-1][2].append(value)
+        else:
+            layers.append((layer, kind, [value]))
+    return layers
+
+
+def _caffemodel(layers, *, packed=True):
+    """Return a NetParameter: its name, an input layer without parameters, a number field, the layers."""
+    content = _field(1, b"a test") + _varint(5 << 3) + b"\x01"
+    content += _field(100, _field(1, b"data") + _field(2, b"HDF5Data"))
+    for name, kind, blobs in layers:
+        parts = b"".join(_field(7, _blob(blob, packed=packed)) for blob in blobs)
+        content += _field(100, _field(1, name.encode()) + _field(2, kind.encode()) + parts)
+    return content
+
+
+def _write(path, content):
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize("scale", [2, 8])
+def test_caffe_model_round_trips_its_parameters(tmp_path, scale, packed):
+    net = MSGNet(scale, "hui")
+    path = _write(tmp_path / "net.caffemodel", _caffemodel(_caffe_layers(net), packed=packed))
+    loaded = load_msg_weights(path, scale)
+    assert loaded.variant == "hui"
+    torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
+
+
+def test_torch_file_round_trips_its_parameters(tmp_path):
+    net = MSGNet(4)
+    path, before = _published(tmp_path / "net.pth", net.state_dict()), torch.get_rng_state()
+    loaded = load_msg_weights(path, 4, "voynov")
+    assert torch.equal(torch.get_rng_state(), before)
+    assert loaded.variant == "voynov"
+    torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
+
+
+def test_code_in_a_file_is_not_run(tmp_path):
+    path, mark = tmp_path / "net.pth", tmp_path / "trapped"
+    for protocol in (0, 2, 4):
+        _refusal(_write(path, pickle.dumps({"model_state_dict": Trap(mark)}, protocol)), load_msg_weights, 4)
+    torch.save({"model_state_dict": _author_state(MSGNet(4).state_dict()), "x": Trap(mark)}, path)
+    assert "which are never loaded" in _refusal(path, load_msg_weights, 4)
+    assert not mark.exists()
+
+
+def test_damaged_and_foreign_files_are_refused(tmp_path):
+    whole, path = _published(tmp_path / "whole.pth").read_bytes(), tmp_path / "net.caffemodel"
+    noise = np.random.default_rng(0).bytes(10_000)
+    foreign = (b"", noise, b"\x80" + noise, b"PK\x03\x04" + noise, b"\x89PNG\r\n\x1a\n")
+    for content in (whole[:5000], whole[:-30], *foreign):
+        assert "expected a torch" in _refusal(_write(tmp_path / "net.pth", content), load_msg_weights, 4)
+    for content in (b"\xff" * 11, b"\xa2\x06\xff\xff\xff\xff\x0f\x00", b"\x0b", b"\xa0\x06\x01", _field(1, b"name")):
+        assert "expected a torch or Caffe model" in _refusal(_write(path, content), load_msg_weights, 4)
+    whole = _caffemodel(_caffe_layers(MSGNet(2, "hui")))
+    for length in np.random.default_rng(0).integers(1, len(whole), 40).tolist():
+        assert "expected" in _refusal(_write(path, whole[:length]), load_msg_weights, 2)
+    assert "for scale 2, the run is at scale 4" in _refusal(_write(path, whole), load_msg_weights, 4)

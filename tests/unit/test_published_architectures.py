@@ -1,4 +1,4 @@
-"""Sparse-to-Dense: the parts against plain computations and the published sizes, and images of any size."""
+"""Sparse-to-Dense and DDRNet: their parts against plain computations, and the published sizes."""
 
 import numpy as np
 import pytest
@@ -7,19 +7,21 @@ from small_scenes import maps, photos
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dsr.methods.images import compute_min_max, upsample_linear_border
+from dsr.methods.networks.ddrnet import DDRNet
 from dsr.methods.networks.sparse_to_dense import BatchNorm, SparseToDense, UpProjection, place_samples
 
 RESNET18 = 11_689_512 - 513_000 + 64 * 49
 """Parameters of ResNet-18 (He et al. 2016) without its classifier, with a fourth input channel."""
 
 
-def _net(scale: int = 4, width: int = 4) -> SparseToDense:
+def _net(scale=4, width=4):
     torch.manual_seed(scale)
     return SparseToDense(scale, width).eval()
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8, 16])
-def test_samples_lie_next_to_the_centres_of_their_blocks_and_zeros_elsewhere(scale: int) -> None:
+def test_samples_lie_next_to_the_centres_of_their_blocks_and_zeros_elsewhere(scale):
     values = maps(3, 5, 2)
     expected = np.zeros((2, 1, 3 * scale, 5 * scale))
     for i in range(3):
@@ -28,7 +30,7 @@ def test_samples_lie_next_to_the_centres_of_their_blocks_and_zeros_elsewhere(sca
     assert np.array_equal(place_samples(values, scale).numpy(), expected)
 
 
-def test_encoder_has_the_parameters_of_resnet18() -> None:
+def test_encoder_has_the_parameters_of_resnet18():
     net = SparseToDense(4, width=64)
     assert sum(each.numel() for part in (net.stem, net.encoder) for each in part.parameters()) == RESNET18
     x = net.encoder(functional.max_pool2d(net.stem(torch.zeros(1, 4, 64, 96)), 3, stride=2, padding=1))
@@ -36,7 +38,7 @@ def test_encoder_has_the_parameters_of_resnet18() -> None:
     assert net.decoder(net.middle(x)).shape == (1, 16, 32, 48)
 
 
-def _unpool_and_convolve(x: Tensor, layer: nn.Module) -> Tensor:
+def _unpool_and_convolve(x, layer):
     """Insert zeros to the right of and below each pixel, then apply the layer's kernel as a 5 x 5 convolution."""
     assert isinstance(layer, nn.ConvTranspose2d)
     batch, channels, height, width = x.shape
@@ -46,7 +48,7 @@ def _unpool_and_convolve(x: Tensor, layer: nn.Module) -> Tensor:
     return functional.conv2d(spread, kernel, padding=2)
 
 
-def test_up_projection_equals_unpooling_and_convolutions() -> None:
+def test_up_projection_equals_unpooling_and_convolutions():
     torch.manual_seed(1)
     block = UpProjection(6).double().eval()
     for layer in block.modules():
@@ -55,7 +57,7 @@ def test_up_projection_equals_unpooling_and_convolutions() -> None:
             layer.running_var = torch.rand_like(layer.running_var) + 0.5
     x = torch.randn(2, 6, 4, 5, dtype=torch.float64)
 
-    def norm(x: Tensor, layer: BatchNorm) -> Tensor:
+    def norm(x, layer):
         mean, var, weight, bias = (
             each.view(1, -1, 1, 1) for each in (layer.running_mean, layer.running_var, layer.weight, layer.bias)
         )
@@ -68,7 +70,7 @@ def test_up_projection_equals_unpooling_and_convolutions() -> None:
     torch.testing.assert_close(block(x), expected, rtol=0, atol=1e-12)
 
 
-def test_normalisation_is_that_of_the_library() -> None:
+def test_normalisation_is_that_of_the_library():
     torch.manual_seed(2)
     layer, expected, x = BatchNorm(3).double(), nn.BatchNorm2d(3).double(), 2 * torch.randn(4, 3, 8, 9).double() + 1
     for training in (True, False):
@@ -77,7 +79,7 @@ def test_normalisation_is_that_of_the_library() -> None:
 
 
 @pytest.mark.parametrize("scale", [2, 8])
-def test_sizes_that_are_no_multiple_of_32_equal_those_that_repeat_the_border(scale: int) -> None:
+def test_sizes_that_are_no_multiple_of_32_equal_those_that_repeat_the_border(scale):
     net = _net(scale).double()
     height, width = 40 // scale, 56 // scale
     rgb, values = photos(scale * height, scale * width).double(), maps(height, width)
@@ -88,7 +90,7 @@ def test_sizes_that_are_no_multiple_of_32_equal_those_that_repeat_the_border(sca
     torch.testing.assert_close(net.upsample(rgb, values), expected, rtol=0, atol=1e-12)
 
 
-def test_holes_are_inpainted_before_the_samples_are_placed() -> None:
+def test_holes_are_inpainted_before_the_samples_are_placed():
     net, rgb, values = _net(), photos(32, 32), maps(8, 8)
     values[..., 4, 4] = torch.nan
     inpainted = values.clone()
@@ -96,7 +98,54 @@ def test_holes_are_inpainted_before_the_samples_are_placed() -> None:
     torch.testing.assert_close(net.upsample(rgb, values), net.upsample(rgb, inpainted), rtol=1e-9, atol=0)
 
 
-def test_width_that_the_decoder_cannot_halve_is_refused() -> None:
-    for width in (0, 6):
-        with pytest.raises(ValueError, match=rf"^width: expected a positive multiple of 4, got {width}"):
-            SparseToDense(4, width)
+# (inputs, outputs, size) of the convolutions of the authors' convResnet and hypercolumn
+DENOISING = [(1, 32, 3), (32, 64, 3), (64, 128, 3), *[(128, 128, 3)] * 4, (256, 64, 3), (128, 32, 3), (64, 1, 3)]
+REFINEMENT = [(1, 8, 3), (1, 8, 3), (16, 16, 3), (32, 32, 3), (32, 32, 3), (64, 64, 3), (64, 64, 3), (64, 64, 3),
+              (112, 16, 1), (16, 4, 1), (4, 1, 1)]  # fmt: skip
+
+
+def _ddrnet(scale: int = 4) -> DDRNet:
+    """Return a small network with weights far from those that it starts with."""
+    torch.manual_seed(scale)
+    net = DDRNet(scale, denoising=4, refinement=4)
+    for parameter in net.parameters():
+        parameter.data.add_(0.3 * torch.randn_like(parameter))
+    return net
+
+
+def _stages(net: DDRNet, rgb: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the denoised and the refined map."""
+    min_max = compute_min_max(values)
+    answer = net.answer_patches({"rgb": rgb, "disparity_lr": values, "min_max": min_max})
+    return answer.stages[0], answer.disparity
+
+
+def test_networks_have_the_parameters_of_the_published_code() -> None:
+    net = DDRNet(4)
+    for part, layers in ((net.denoise, DENOISING), (net.refine, REFINEMENT)):
+        expected = sum(inputs * outputs * size**2 + outputs for inputs, outputs, size in layers)
+        assert sum(each.numel() for each in part.parameters()) == expected
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8])
+def test_new_network_is_bicubic_upsampling(scale: int) -> None:
+    torch.manual_seed(0)
+    values, rgb = maps(5, 6), photos(5 * scale, 6 * scale)
+    expected = upsample_linear_border(values, scale)
+    for stage in _stages(DDRNet(scale, denoising=4, refinement=4), rgb, values):
+        torch.testing.assert_close(stage, expected.float(), rtol=1e-6, atol=0)
+
+
+def test_refined_map_is_the_result_and_the_denoised_one_knows_no_photo() -> None:
+    net, values, rgb = _ddrnet(), maps(6, 7), photos(24, 28)
+    denoised, refined = _stages(net, rgb, values)
+    assert torch.equal(refined, net.upsample(rgb, values).float())
+    others = _stages(net, 1 - rgb, values)
+    assert torch.equal(others[0], denoised)
+    assert not torch.allclose(others[1], refined, rtol=1e-4)
+
+
+def test_photo_counts_by_its_luma() -> None:
+    net, values, rgb = _ddrnet(), maps(6, 7), photos(24, 28)
+    grey = (0.299 * rgb[:, :1] + 0.587 * rgb[:, 1:2] + 0.114 * rgb[:, 2:]).expand(-1, 3, -1, -1)
+    torch.testing.assert_close(net.upsample(grey, values), net.upsample(rgb, values), rtol=1e-6, atol=0)
