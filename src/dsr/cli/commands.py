@@ -358,10 +358,6 @@ def add_data_command(commands: Any) -> None:
     ready.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="as for eval.py, such as dataset.size=256")
     ready.add_argument("--config-dir", type=Path, metavar="DIR", help="a directory of your own with dataset/NAME.yaml")
     ready.set_defaults(run=_run_data_task, task="prepare")
-    for task in (fetch, check):
-        task.add_argument(
-            "--accept-changed", action="store_true", help="take files whose checksum differs from the recorded one"
-        )
 
 
 def _run_data_task(options: argparse.Namespace, console: Console, catalogue: Any) -> list[str]:

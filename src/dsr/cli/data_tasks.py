@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dsr.data.download.collections import CATALOGUE, Collection, Item, find
-from dsr.data.download.fetching import Server, absent, checksums_of, get, state, verify
+from dsr.data.download.fetching import absent, checksums_of, expect_address, get, state, verify
 from dsr.methods import weights
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import data_root
@@ -84,7 +84,7 @@ def get_data_sets(options: argparse.Namespace, console: Console, catalogue: Mapp
     """Show what will be downloaded and its licence, ask for confirmation on a terminal, and download it."""
     collections = find(options.names, catalogue)
     if options.mirror is not None:
-        Server.of(options.mirror)  # is checked before anything is shown
+        expect_address(options.mirror)  # before anything is shown
     root, progress = data_root(), ConsoleProgress(console)
     items = {item.path: item for collection in collections for item in collection.items}
     missing = len(absent(items.values(), root))
@@ -94,11 +94,11 @@ def get_data_sets(options: argparse.Namespace, console: Console, catalogue: Mapp
         show(console, f"{missing} of {len(items)} files are missing in {root.absolute()}")
     if missing and not options.yes and sys.stdin.isatty() and console.is_terminal and not _agreed(console):
         return []
-    given = {name: getattr(options, name) for name in ("mirror", "accept_changed", "keep_archives")}
+    given = {"mirror": options.mirror, "keep_archives": options.keep_archives}
     problems = get(items.values(), root, progress, **given) if items else []
     for collection in collections:
         if not collection.items:
-            problems += verify(collection, root, progress, accept_changed=options.accept_changed)
+            problems += verify(collection, root, progress)
     if not problems:
         show(console, f"{', '.join(collection.name for collection in collections)}: complete")
     return problems
@@ -128,7 +128,7 @@ def verify_data_sets(options: argparse.Namespace, console: Console, catalogue: M
     """Check collections, and show which are complete."""
     problems, progress = [], ConsoleProgress(console)
     for collection in find(options.names, catalogue):
-        found = verify(collection, data_root(), progress, accept_changed=options.accept_changed)
+        found = verify(collection, data_root(), progress)
         if not found:
             show(console, f"{collection.name}: complete, as recorded")
         elif collection.items:

@@ -32,7 +32,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.download import collections
+from dsr.data.download.collections import CATALOGUE
 from dsr.data.frame_files import expect_size, read_picture
 from dsr.data.preparation import Preparation, PreparedDataset, SceneRecord
 from dsr.data.reference_depth import smooth_levels
@@ -194,18 +194,16 @@ def _levels_camera(files: Files, year: int, height: int, width: int) -> tuple[Ca
     return Camera(width, height, focal, focal, cx, cy, _BASELINE, shift / per_pixel), per_pixel
 
 
-def _names(folders: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of scenes: those of their folders in lower case."""
-    return tuple(name.casefold() for name in folders)
+def _scenes(dataset: str, folder: str) -> tuple[str, ...]:
+    """Return the names of scenes in the catalogue: those of their folders in lower case."""
+    places = (Path(item.path).parent for item in CATALOGUE[dataset].items)
+    names = (place.name.removesuffix("-perfect").casefold() for place in places if place.parent.name == folder)
+    return tuple(dict.fromkeys(names))
 
 
-EVALUATION_2014, TRAINING_2014 = _names(collections.EVALUATION_2014), _names(collections.TRAINING_2014)
-SCENES = {
-    2001: _names(collections.SCENES_2001),
-    2003: _names(collections.SCENES_2003),
-    2005: _names(collections.SCENES_2005),
-    2006: _names(collections.SCENES_2006),
-}
+EVALUATION_2014 = _scenes("middlebury", "middlebury2014")
+TRAINING_2014 = _scenes("middlebury_train", "middlebury2014")
+SCENES = {year: _scenes(f"middlebury{year}", f"middlebury{year}") for year in (2001, 2003, 2005, 2006)}
 TRAINING = {2001: SCENES[2001], 2006: SCENES[2006], 2014: TRAINING_2014}  # scenes to train on by year
 _FILES_2014 = ("im0.png", "calib.txt", "disp0.pfm", "disp0GT.pfm")
 
