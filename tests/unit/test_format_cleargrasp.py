@@ -1,12 +1,9 @@
 """ClearGrasp, of files of our own: captures with twins, renderings with their bent depth, regions, every damage."""
 
-import re
-
 import numpy as np
 import OpenEXR
 import pytest
 import torch
-from refusals import refused
 from small_files import encoded_png as png
 from small_files import written
 
@@ -76,21 +73,6 @@ def rendering(folder, name="000000000"):
     return files, depth
 
 
-def test_capture_has_the_glass_as_measured_and_the_twin_as_the_truth(tmp_path):
-    scene = load_capture(*capture(tmp_path), "cleargrasp", "a")
-    assert list(scene.measured) == [1]
-    assert scene.measured[1].isnan().nonzero().tolist() == [[0, 0, 0]]
-    assert scene.depth.isnan().nonzero().tolist() == [[0, 35, 63]]
-    known = ~np.isnan(scene.depth[0].numpy())
-    np.testing.assert_array_equal(scene.depth[0].numpy()[known], TWIN[known])
-    difference = scene.measured[1][0] - scene.depth[0]
-    assert (difference[12, 30].item(), difference[2, 3].item()) == (0.25, 0)
-    camera = scene.camera
-    assert (camera.width, camera.height) == (64, 36)
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (46.5, 46, 32, 17.5)
-    assert 0.19 < scene.rgb.mean() < 0.21
-
-
 def test_regions_are_the_mask_the_rest_and_five_pixels_on_either_side_of_its_outline(tmp_path):
     regions = load_capture(*capture(tmp_path), "cleargrasp", "a").regions
     assert {each.dtype for each in regions.values()} == {torch.uint8}
@@ -139,39 +121,8 @@ def test_scenes_are_found_by_split_and_need_all_their_files(tmp_path):
     assert all(data.load(data.scenes()[0]).dataset == data.name for data in both.values())
     assert both[True].evaluation
     assert not ClearGrasp(str(tmp_path), True, "train").evaluation
-    with pytest.raises(ValueError, match="split: expected one of val, test, train, or null, got tests"):
+    with pytest.raises(ValueError, match="split: expected one of val, test, train, null"):
         ClearGrasp(str(tmp_path), False, "tests")
-
-
-@pytest.mark.parametrize(
-    ("which", "content", "message"),
-    [
-        (0, b"", "expected a picture"),
-        (0, png(np.zeros((35, 64, 3), np.uint8)), "expected 36 x 64 pixels"),
-        (1, b"text", "expected an OpenEXR file"),
-        (2, b"", "expected an OpenEXR file"),
-        (3, png(MASK)[:60], "expected a picture"),
-        (3, png(MASK[1:]), "expected 36 x 64 pixels"),
-        (4, CAMERA.replace(b"fx: 46.5", b"fx: wide"), "expected a number at each of xres, yres, fx, fy, cx, cy"),
-        (4, CAMERA.replace(b"cy", b"cyy"), "expected a number at each of xres, yres, fx, fy, cx, cy"),
-        (4, CAMERA.replace(b"46.5", b"0"), "expected fx 0 cx 0 fy cy 0 0 1 of a 36 x 64 picture"),
-        (4, b"\xff\x00", "expected a number at each of xres, yres, fx, fy, cx, cy"),
-    ],
-)
-def test_damaged_or_foreign_file_of_a_capture_is_refused_in_one_line(tmp_path, capfd, which, content, message):
-    files = capture(tmp_path)
-    files[which].write_bytes(content)
-    assert re.match(message, refused(lambda: load_capture(*files, "cleargrasp", "a"), files[which], capfd))
-
-
-@pytest.mark.parametrize(("depth", "message"), [(-TWIN, "expected positive depth"), (TWIN * 0, "expected at least one"),
-                                                (TWIN[1:], "expected 36 x 64 pixels")])  # fmt: skip
-@pytest.mark.parametrize("synthetic", [False, True])
-def test_depth_that_is_none_is_refused_in_one_line(tmp_path, capfd, depth, message, synthetic):
-    files = rendering(tmp_path)[0] if synthetic else capture(tmp_path)
-    exr(files[1], depth)
-    load = load_rendering if synthetic else load_capture
-    assert refused(lambda: load(*files, "cleargrasp", "a"), files[1], capfd).startswith(message)
 
 
 def test_real_captures_agree_outside_of_the_glass(shared):

@@ -71,12 +71,6 @@ def test_frames_are_counted_from_1(labelled):
     assert find_frames(labelled) == {"0001": (labelled, 1), "0002": (labelled, 2)}
 
 
-@pytest.mark.parametrize("number", [0, -1, 3, 1449])
-def test_missing_frame_is_refused(labelled, capfd, number):
-    message = refusal(lambda path: load_frame(path, number, "nyu", "a"), labelled, capfd)
-    assert message.endswith(f"expected a frame from 1 to 2, got {number}")
-
-
 @pytest.mark.parametrize(
     "damage",
     [

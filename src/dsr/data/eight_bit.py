@@ -25,12 +25,13 @@ from typing import Literal
 
 import torch
 
-from dsr.data.frame_files import expect_choice, expect_size, find_beside, in_natural_order, read_picture
+from dsr.data.frame_files import expect_size, find_beside, in_natural_order, read_picture
 from dsr.data.preparation import FrameSet
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera, baseline_times_focal, from_range
 from dsr.io.images import read_levels
 from dsr.sample import Scene, Unit
+from dsr.utils.guards import expect_one_of
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,6 @@ class EightBit(FrameSet):
     soft_edges = True
 
     def __init__(self, root: str, benchmark: Literal["lu", "middlebury8"], scenes: SceneSelection = None) -> None:
-        expect_choice("benchmark", benchmark, BENCHMARKS)
+        expect_one_of("benchmark", benchmark, BENCHMARKS)
         find = functools.partial(find_frames, dataset=benchmark)
         super().__init__(benchmark, root, find, load_frame, scenes, BENCHMARKS[benchmark].scenes)

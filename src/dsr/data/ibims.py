@@ -32,7 +32,6 @@ from dsr.data.frame_files import (
     find_beside,
     in_natural_order,
     read_16bit,
-    read_bytes,
     read_picture,
     to_camera,
     to_depth,
@@ -44,6 +43,7 @@ from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
 from dsr.io.images import read_levels
 from dsr.sample import Scene
+from dsr.utils.guards import read_text
 
 COUNT = 100  # number of scenes
 SIZE = (480, 640)
@@ -107,7 +107,7 @@ def load_pictures(rgb_path: Path, depth_path: Path, calibration_path: Path, *pat
     expect_size(rgb_path, rgb, SIZE)
     for path, image in ((depth_path, depth), *((given[key], mask) for key, mask in masks.items())):
         expect_size(path, image, SIZE)
-    text = read_bytes(calibration_path, "a text file of fx,fy,cx,cy").decode("utf-8", "replace")
+    text = read_text(calibration_path)
     try:
         fx, fy, cx, cy = map(float, text.replace(",", " ").split())
     except ValueError as error:

@@ -45,7 +45,6 @@ from dsr.utils.guards import naming, natural_key, numbers_in, read_limited
 _MATRIX = re.compile(r"\[\s*(\S+)\s+0\s+(\S+)\s*;\s*0\s+(\S+)\s+(\S+)\s*;\s*0\s+0\s+1\s*\]")
 _FULL_HEIGHT, _FULL_FOCAL, _BASELINE = 1110, 3740.0, 0.16
 _ASSUMED_SHIFT = 200.0
-_TEDDY = MappingProxyType({"fx": 1500.0, "fy": 1500.0, "baseline": 0.08, "doffs": 52.0, "cx": 199.0, "cy": 187.0})
 _NOISY = MappingProxyType({4: "_depth_2_n.png", 8: "_depth_3_n.png"})
 
 
@@ -128,13 +127,6 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
     return Scene(dataset, name, _photo(files.photo, camera), camera, depth, measured)
 
 
-def shortcoming(files: Files, year: int) -> str:
-    """Return why the depth of a scene of 2001 to 2006 is not metric; empty where it is."""
-    if year in (2001, 2003):
-        return "depth is not metric: no camera was published, that of Teddy in the evaluation kit is assumed"
-    return "" if files.shift else "depth is not metric: there is no dmin.txt, the shift of Art is assumed"
-
-
 def read_calibration(path: Path) -> Camera:
     """Return the left camera of a ``calib.txt``.
 
@@ -178,11 +170,10 @@ def _depth(path: Path, disparity: np.ndarray, camera: Camera) -> Tensor:
 
 def _levels_camera(files: Files, year: int, height: int, width: int) -> tuple[Camera, float]:
     """Return the camera of a data set of levels at a map's size, and levels per pixel."""
-    if year == 2003:
-        return Camera(width, height, **_TEDDY), 4
     cx, cy = (width - 1) / 2, (height - 1) / 2
-    if year == 2001:
-        return Camera(width, height, **{**_TEDDY, "cx": cx, "cy": cy}), 8
+    if year in (2001, 2003):  # Teddy's
+        camera = Camera(width, height, 1500.0, 1500.0, 199.0, 187.0, 0.08, 52.0)
+        return (camera, 4) if year == 2003 else (replace(camera, cx=cx, cy=cy), 8)
     per_pixel = round(_FULL_HEIGHT / height)
     if per_pixel not in (1, 2, 3):
         raise ValueError(f"{files.disparity}: expected a height near {_FULL_HEIGHT}, a half or a third, got {height}")
@@ -209,13 +200,7 @@ _FILES_2014 = ("im0.png", "calib.txt", "disp0.pfm", "disp0GT.pfm")
 
 
 class Middlebury(PreparedDataset):
-    """Scenes of Middlebury 2014.
-
-    Args:
-        without_offset: names of the scenes whose disparity offset is replaced by 0, which makes their depth wrong. The
-            paper does so with Vintage, but not with Recycle and Playroom.
-
-    """
+    """Scenes of Middlebury 2014; the paper leaves the offset out of Vintage, but not of Recycle and Playroom."""
 
     def __init__(
         self,
@@ -287,13 +272,15 @@ def records_2014(folder: Path, dataset: str, without_offset: Collection[str] = (
 
 
 def records_levels(folder: Path, dataset: str, year: int, *, smooth: bool = True) -> dict[str, SceneRecord]:
-    """Return the records of the scenes of 2001 to 2006 on disk."""
-    return {
-        name: SceneRecord(
-            tuple(path for path in (files.photo, files.disparity, files.shift, *files.measured.values()) if path),
-            functools.partial(load_levels, files, dataset, name, year, smooth=smooth),
-            settings="" if smooth else "terraces",
-            note=shortcoming(files, year),
-        )
-        for name, files in find_levels(folder).items()
-    }
+    """Return the records of the scenes of 2001 to 2006 on disk, with notes of those whose depth is not metric."""
+    records = {}
+    for name, files in find_levels(folder).items():
+        note = ""
+        if year in (2001, 2003):
+            note = "depth is not metric: no camera was published, that of Teddy in the evaluation kit is assumed"
+        elif files.shift is None:
+            note = "depth is not metric: there is no dmin.txt, the shift of Art is assumed"
+        paths = tuple(path for path in (files.photo, files.disparity, files.shift, *files.measured.values()) if path)
+        load = functools.partial(load_levels, files, dataset, name, year, smooth=smooth)
+        records[name] = SceneRecord(paths, load, settings="" if smooth else "terraces", note=note)
+    return records

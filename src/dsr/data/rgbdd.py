@@ -29,7 +29,6 @@ from typing import Literal
 
 from dsr.data.frame_files import (
     NO_CAMERA,
-    expect_choice,
     expect_size,
     find_beside,
     in_natural_order,
@@ -40,6 +39,7 @@ from dsr.data.frame_files import (
 from dsr.data.preparation import FrameSet
 from dsr.data.scene_source import SceneSelection
 from dsr.sample import Scene
+from dsr.utils.guards import expect_one_of
 
 Split = Literal["test", "train"]
 COUNTS = {"test": 405, "train": 2215}  # numbers of scenes
@@ -91,7 +91,7 @@ class RGBDD(FrameSet):
     soft_edges = True
 
     def __init__(self, root: str, real: bool, split: Split = "test", scenes: SceneSelection = None) -> None:
-        expect_choice("split", split, COUNTS)
+        expect_one_of("split", split, COUNTS)
         name, load = ("rgbdd_real", load_measured_frame) if real else ("rgbdd", load_pair)
         find = functools.partial(find_frames, split=split, measured=real)
         super().__init__(name, root, find, load, scenes, count=COUNTS[split])
