@@ -50,11 +50,7 @@ Files = tuple[Path, Path, Path, Path | None, Path | None]
 
 
 def find_frames(root: Path, split: Split | None = None) -> dict[str, Files]:
-    """Return the first five arguments of :func:`load_frame` by name "41069021_305.244", in order.
-
-    ``root`` may be any directory above or below ``Training`` and ``Validation``; what is in no ``Training`` is for
-    validation.
-    """
+    """Return the files of frames by name "41069021_305.244", in order; what is in no ``Training`` is for validation."""
     found: dict[str, Files] = {}
     for folder in ("wide", "color"):
         others = ("highres_depth/{}.png", "lowres_depth/{}.png")
@@ -78,11 +74,7 @@ def load_frame(
     *,
     min_confidence: int = 0,
 ) -> Scene:
-    """Return one frame with the lidar's map as the measured one.
-
-    Without ``intrinsics_path``, 60 degrees of horizontal view are assumed. Pixels of the lidar below ``min_confidence``
-    become holes.
-    """
+    """Return one frame with the lidar's map as the measured one, with holes below ``min_confidence``."""
     rgb, depth = read_frame(rgb_path, depth_path, size=_SIZE)
     measured = read_millimetres(measured_path)
     expect_size(measured_path, measured, _SIZE_LR)
@@ -112,6 +104,9 @@ def read_intrinsics(path: Path) -> Camera:
 
 
 NOTE = f"there is no .pincam file: {ASSUMED_FOV:g} degrees of horizontal view are assumed"
+
+
+DETECTED = ((find_frames, load_frame, "arkitscenes"),)
 
 
 class ARKitScenes(FrameSet):

@@ -74,10 +74,7 @@ _ENTRY = re.compile(rf"^({'|'.join(_KEYS)})\s*:\s*([-+.\deE]+)\s*(?:#.*)?$", re.
 
 
 def find_captures(root: Path, split: Split | None = None) -> dict[str, tuple[Path, ...]]:
-    """Return the first arguments of :func:`load_capture` by name "real-val/d435/000000080", in order.
-
-    The name of a folder of a split, or of one above it, ends in the split's.
-    """
+    """Return the files of captures by name "real-val/d435/000000080", in order."""
     found = {}
     for folder, _, files in walk(root):
         if "camera_intrinsics.yaml" in files and _is_of(folder, split):
@@ -90,7 +87,7 @@ def find_captures(root: Path, split: Split | None = None) -> dict[str, tuple[Pat
 
 
 def find_renderings(root: Path, split: Split | None = None) -> dict[str, tuple[Path, ...]]:
-    """Return the first arguments of :func:`load_rendering` by name "square-plastic-bottle-val/000000000", in order."""
+    """Return the files of renderings by name "square-plastic-bottle-val/000000000", in order."""
     found = {}
     for folder, below, _ in walk(root):
         if {each.partition("/")[0] for each in _SYNTHETIC} <= set(below) and _is_of(folder, split):
@@ -103,7 +100,7 @@ def find_renderings(root: Path, split: Split | None = None) -> dict[str, tuple[P
 
 
 def _is_of(folder: Path, split: Split | None) -> bool:
-    """Return whether a folder belongs to a split."""
+    """Return whether a folder, or one above it, has a name that ends in that of a split."""
     return split is None or any(part.endswith(f"-{split}") for part in folder.resolve().parts)
 
 
@@ -166,6 +163,9 @@ def read_camera(path: Path) -> Camera:
     except (KeyError, ValueError) as error:
         raise ValueError(f"{path}: expected a number at each of {', '.join(_KEYS)}, got {found}") from error
     return given_camera(intrinsics, (round(height), round(width)), path)
+
+
+DETECTED = ((find_captures, load_capture, "cleargrasp"), (find_renderings, load_rendering, "cleargrasp_synthetic"))
 
 
 class ClearGrasp(FrameSet):

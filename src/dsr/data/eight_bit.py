@@ -64,7 +64,7 @@ BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
 
 
 def find_frames(root: Path, dataset: str) -> dict[str, tuple[Path, Path]]:
-    """Return the photos and maps of a benchmark, the first two arguments of :func:`load_frame`, by name, in order."""
+    """Return the photos and maps of a benchmark by name, in order."""
     found: dict[str, tuple[Path, Path]] = {}
     prefix = BENCHMARKS[dataset].prefix
     for spelling in ("output", "ouput"):
@@ -86,6 +86,9 @@ def load_frame(rgb_path: Path, levels_path: Path, dataset: str, name: str) -> Sc
 
 
 NOTE = "depth is not metric: the camera is invented, and levels are read as disparity"
+
+
+DETECTED = tuple((functools.partial(find_frames, dataset=each), load_frame, each) for each in BENCHMARKS)
 
 
 class EightBit(FrameSet):

@@ -62,6 +62,9 @@ def load_frame(
     return Scene(dataset, name, rgb, camera, truth, {1: measured})
 
 
+DETECTED = ((find_frames, load_frame, "hammer"),)
+
+
 class Hammer(FrameSet):
     """Frames of HAMMER at their own size, a camera's map as measured at x1; ``naked`` are those without objects."""
 

@@ -56,10 +56,7 @@ Pictures = tuple[Path, Path, Path, *tuple[Path | None, ...]]
 
 
 def find_matrices(root: Path) -> dict[str, tuple[Path]]:
-    """Return the MATLAB files of scenes, the first argument of :func:`load_matrices`, by name, in order.
-
-    Results of methods, ``*_results.mat``, are left out.
-    """
+    """Return the MATLAB files of scenes by name, in order, without results of methods, ``*_results.mat``."""
     found: dict[str, tuple[Path]] = {}
     for folder, _, files in walk(root):
         names = (file.removesuffix(".mat") for file in files if file.endswith(".mat"))
@@ -135,6 +132,9 @@ def _scene(
     regions = {"planes": planes.astype(np.uint8), "edges": (masks.get("edges", np.zeros(SIZE)) > 0).astype(np.uint8)}
     found = {key: torch.from_numpy(region)[None] for key, region in regions.items() if region.any()}
     return Scene(dataset, name, rgb, camera, truth, regions=found)
+
+
+DETECTED = ((find_pictures, load_pictures, "ibims"),)
 
 
 class IBims(PreparedDataset):

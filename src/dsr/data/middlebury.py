@@ -40,7 +40,7 @@ from dsr.data.scene_source import WITHOUT_OFFSET, SceneSelection
 from dsr.geometry.camera import Camera, from_range
 from dsr.io.images import read_levels, read_map
 from dsr.sample import Scene
-from dsr.utils.guards import naming, natural_key, numbers_in, read_limited
+from dsr.utils.guards import naming, natural_key, numbers_in, read_text
 
 _MATRIX = re.compile(r"\[\s*(\S+)\s+0\s+(\S+)\s*;\s*0\s+(\S+)\s+(\S+)\s*;\s*0\s+0\s+1\s*\]")
 _FULL_HEIGHT, _FULL_FOCAL, _BASELINE = 1110, 3740.0, 0.16
@@ -108,10 +108,7 @@ def load_2014(folder: Path, dataset: str, name: str, *, offset: bool = True) -> 
 
 
 def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: bool = True) -> Scene:
-    """Return a scene of 2001 to 2006; the year of the data set says how levels count.
-
-    ``smooth`` removes the steps of the rounding, see :mod:`dsr.data.reference_depth`.
-    """
+    """Return a scene of 2001 to 2006; ``smooth`` removes the steps of the rounding to levels."""
     levels = read_levels(files.disparity).astype(np.float64)
     height, width = levels.shape
     camera, per_pixel = _levels_camera(files, year, height, width)
@@ -128,14 +125,8 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
 
 
 def read_calibration(path: Path) -> Camera:
-    """Return the left camera of a ``calib.txt``.
-
-    Lines are ``key=value`` with blanks anywhere; ``cam0`` is a matrix as MATLAB writes it, ``baseline`` in millimetres,
-    the rest in pixels.
-    """
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a calibration, there is none")
-    lines = read_limited(path).decode("utf-8", "replace").splitlines()
+    """Return the left camera of a ``calib.txt``: lines ``key=value``, baseline in millimetres, the rest in pixels."""
+    lines = read_text(path).splitlines()
     entries = {key.strip(): value.strip() for key, equals, value in (line.partition("=") for line in lines) if equals}
     matrix = _MATRIX.fullmatch(entries.get("cam0", ""))
     if matrix is None:
@@ -179,8 +170,7 @@ def _levels_camera(files: Files, year: int, height: int, width: int) -> tuple[Ca
         raise ValueError(f"{files.disparity}: expected a height near {_FULL_HEIGHT}, a half or a third, got {height}")
     shift = _ASSUMED_SHIFT
     if files.shift is not None:
-        text = read_limited(files.shift).decode("utf-8", "replace").strip()
-        shift = _number(files.shift, "dmin", text)
+        shift = _number(files.shift, "dmin", read_text(files.shift).strip())
     focal = _FULL_FOCAL / per_pixel
     return Camera(width, height, focal, focal, cx, cy, _BASELINE, shift / per_pixel), per_pixel
 

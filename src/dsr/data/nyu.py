@@ -49,19 +49,13 @@ _FRAME = MappingProxyType({
 
 
 def find_frames(path: Path) -> dict[str, tuple[Path, int]]:
-    """Return the file and the frame's number, the first two arguments of :func:`load_frame`, by name "0001" to "1449".
-
-    Numbers count from 1, as in the official split of the frames.
-    """
+    """Return the file and the frame's number by name "0001" to "1449", as the official split counts."""
     with _opened(path) as arrays:
         return {f"{number:04d}": (path, number) for number in range(1, len(arrays["images"]) + 1)}
 
 
 def load_frame(path: Path, number: int, dataset: str, name: str, *, filled: bool = False, crop: bool = True) -> Scene:
-    """Return a frame by its number from 1, with the Kinect's depth, or the authors' ``filled`` one.
-
-    ``crop`` cuts off the border, which leaves 427 x 561 pixels.
-    """
+    """Return a frame by its number from 1; ``crop`` cuts off the border, which leaves 427 x 561 pixels."""
     key = "depths" if filled else "rawDepths"
     damaged = f"{path}: expected frame {number} of {key} and images, got a damaged file"
     with _opened(path) as arrays, refusing(damaged, OSError):
@@ -78,10 +72,7 @@ def load_frame(path: Path, number: int, dataset: str, name: str, *, filled: bool
 
 
 def find_files(root: Path) -> dict[str, tuple[Path, Path]]:
-    """Return the photos and depths that lie in files of their own, arguments of :func:`load_files`, by name, in order.
-
-    Names are those of the frames in the labelled file: ``RGB/1000.jpg`` is "1001".
-    """
+    """Return photos and depths in files of their own by the frame's name: ``RGB/1000.jpg`` is "1001"."""
     found: dict[str, tuple[Path, Path]] = {}
     for _, number, (photo, depth) in find_beside(root, "RGB", _PHOTO, ("Depth/{}.npy",)):
         found.setdefault(f"{int(number) + 1:04d}", (photo, depth))
@@ -120,6 +111,9 @@ def _checked(path: Path, file: h5py.File, key: str) -> h5py.Dataset:
         sizes = ", ".join(map(str, shape))
         raise ValueError(f"{path}: {key}: expected {dtype} (frames, {sizes}), got {came[0]} {came[1]}")
     return array
+
+
+DETECTED = ((find_files, load_files, "nyu"),)
 
 
 class NYU(PreparedDataset):

@@ -51,14 +51,11 @@ _DEPTH, _MEASURED = "{0}_HR_gt.png", "{0}_LR_fill_depth.png"
 
 
 def find_frames(root: Path, split: Split | None = None, measured: bool = False) -> dict[str, Files]:
-    """Return photos, true depth and, if ``measured``, the phone's depth, by their number "20200509112638", in order.
-
-    Images in ``RGB`` and ``Depth`` are test images.
-    """
+    """Return photos, true depth and, if ``measured``, the phone's depth, by their number "20200509112638", in order."""
     found: dict[str, Files] = {}
     for name, files in _find_owners_layout(root, split, measured=measured):
         found.setdefault(name, files)
-    if split in (None, "test"):
+    if split in (None, "test"):  # those in circulation
         others = (f"Depth/{_DEPTH}", f"DepthLR/{_MEASURED}")[: 2 if measured else 1]
         for _, name, files in find_beside(root, "RGB", _PHOTO, others):
             found.setdefault(name, files)
@@ -82,6 +79,9 @@ def _find_owners_layout(root: Path, split: Split | None, *, measured: bool) -> I
             wanted = [name.format(folder.name) for name in names]
             if set(wanted) <= set(files):
                 yield folder.name, tuple(folder / name for name in wanted)
+
+
+DETECTED = ((find_frames, load_pair, "rgbdd"),)
 
 
 class RGBDD(FrameSet):

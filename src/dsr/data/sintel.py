@@ -45,10 +45,7 @@ _CAM_LENGTH = 4 + 8 * (9 + 12)
 
 
 def find_frames(root: Path, rendering: Literal["clean", "final"] = "final") -> dict[str, tuple[Path, Path, Path]]:
-    """Return colour, depth and camera files, the first three arguments of :func:`load_frame`, by name, in order.
-
-    A name is ``SEQUENCE/frame_NNNN``. ``root`` holds ``training``, or is it. A frame that lacks a file is left out.
-    """
+    """Return colour, depth and camera files by name ``SEQUENCE/frame_NNNN``; ``root`` holds ``training``, or is it."""
     base = root / "training" if (root / "training").is_dir() else root
     found = {}
     for depth in sorted((base / "depth").glob("*/frame_*.dpt"), key=natural_key):
@@ -106,6 +103,9 @@ def sintel_frames() -> tuple[str, ...]:
         numbers = [1] if index < _SEQUENCES_WITH_THREE else []
         frames += [f"{sequence}_frame_{number:04d}" for number in (*numbers, length // 3, 2 * length // 3)]
     return tuple(frames)
+
+
+DETECTED = ((find_frames, load_frame, "sintel"),)
 
 
 class Sintel(FrameSet):

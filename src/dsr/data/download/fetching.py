@@ -513,7 +513,7 @@ def _lack(item: Item, checksums: Checksums) -> str | None:
     """Return what is missing of an item or has another size than recorded, None if nothing is."""
     root, entry = checksums.root, checksums.get(item.path)
     if item.unpack_to is None:
-        files: Mapping[str, int | None] = {item.path: entry and entry.size}
+        files: Mapping[str, int | None] = {item.path: None if entry is None else entry.size}
     elif entry is None or entry.files is None:
         return f"{root / item.unpack_to}: expected what {Path(item.path).name} unpacks to, there is no record of it"
     else:
