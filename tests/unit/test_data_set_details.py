@@ -2,16 +2,17 @@
 
 import struct
 
+import cv2
 import numpy as np
 import pytest
 import torch
-from data_set_files import LEVELS, VGA, dpt, npy, opened, ramp, rays, write_frame
+from data_set_files import LEVELS, VGA, dpt, npy, opened, ramp, rays, turned, write_frame
 from PIL import Image
 from refusals import refused
 from small_files import encoded_png as png
 from small_files import png_by_its_specification, written
 
-from dsr.data import arkitscenes, icl, sintel, tartanair
+from dsr.data import arkitscenes, icl, sintel, sunrgbd, tartanair
 from dsr.data.eight_bit import NOTE, EightBit
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import to_range
@@ -233,3 +234,87 @@ def test_real_frames_of_rendered_sets_are_read(shared):
     folder = shared / "real/icl_nuim/living"
     depth = icl.load_frame(folder / "rgb.png", folder / "depth.png", "icl_nuim", "living").depth
     assert (depth.min().item(), depth.max().item()) == (1.641, 3.43)
+
+
+def test_depth_of_sun_rgbd_is_the_sensors_or_the_refined_one_of_one_picture_each(tmp_path, capfd):
+    kind = write_frame("sunrgbd", tmp_path)
+    refined = written(tmp_path / "kv2/x/depth_bfx/2.png", png(turned(ramp(384, 512, 8181))))
+    assert opened(kind, tmp_path, refined=True).load(kind.name).depth[0, 10, 20].item() == 8.221
+    refined.with_name("3.png").write_bytes(b"")
+    data = opened(kind, tmp_path, refined=True)
+    assert "got 2" in refused(lambda: data.load(kind.name), refined.parent, capfd)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "350 0 255 0 355 190 0 0", "350 0 255 0 355 190 0 0 1 0", "fx = 3", "1" * 5000, "nan 0 255 0 355 190 0 0 1",
+        "-3 0 255 0 355 190 0 0 1", "350 0 999 0 355 190 0 0 1", "350 0 255 0 355 -9 0 0 1",
+        "350 2 255 0 355 190 0 0 1", "350 0 255 0 355 0 1 1 1", "1e300 0 255 0 1e300 190 0 0 1",
+    ],
+)  # fmt: skip
+def test_invalid_intrinsics_are_refused(tmp_path, capfd, text):
+    kind = write_frame("sunrgbd", tmp_path, txt=text.encode())
+    path = tmp_path / "kv2/x/intrinsics.txt"
+    assert "expected " in refused(lambda: opened(kind, tmp_path).load(kind.name), path, capfd)
+
+
+def test_folder_of_sun_rgbd_without_intrinsics_needs_given_ones(tmp_path, capfd):
+    kind = write_frame("sunrgbd", tmp_path)
+    (tmp_path / "kv2/x/intrinsics.txt").unlink()
+    message = refused(lambda: opened(kind, tmp_path).load(kind.name), tmp_path / "kv2/x", capfd)
+    assert "intrinsics=(fx, fy, cx, cy)" in message
+    assert opened(kind, tmp_path, intrinsics=(300, 301, 1, 2)).load(kind.name).camera.cy == 2
+    data = opened(kind, tmp_path, intrinsics=(300, 301, 1, 2000))
+    assert "expected " in refused(lambda: data.load(kind.name), "intrinsics", capfd)
+
+
+def test_scenes_of_sun_rgbd_are_found_at_any_depth_by_their_path(tmp_path):
+    names = ["kv1/NYUdata/NYU0002", "kv1/NYUdata/NYU0001", "xtion/sun3ddata/a/b/c", "realsense/lg/x"]
+    for name in names:
+        depth = "depth_bfx" if "lg" in name else "depth"
+        touch(tmp_path / name, "image/1.jpg", f"{depth}/1.png", "inner/image/1.jpg", "inner/depth/1.png")
+    touch(tmp_path, "SUNRGBDtoolbox/image/1.jpg")
+    assert list(sunrgbd.find_frames(tmp_path)) == sorted(names)
+    assert sunrgbd.find_frames(tmp_path)["realsense/lg/x"] == (tmp_path / "realsense/lg/x",)
+    assert list(sunrgbd.find_frames(tmp_path / names[0])) == ["NYU0002"]
+
+
+def test_real_scenes_are_read_and_the_refined_depth_agrees_where_both_are_known(shared):
+    frames = sunrgbd.find_frames(shared / "real/sunrgbd")
+    assert list(frames) == ["2014-12-18_11-31-54_260595134347", "img_0063"]
+    for name, arguments in frames.items():
+        raw = sunrgbd.load_frame(*arguments, "sunrgbd", name)
+        refined = sunrgbd.load_frame(*arguments, "sunrgbd", name, refined=True)
+        assert 0.1 < raw.depth.isnan().double().mean() < 0.4
+        assert not refined.depth.isnan().any()
+        assert (raw.depth - refined.depth).abs().nanmedian() < 0.01
+
+
+def test_nyu_crop_starts_at_column_40_and_row_44_as_its_intrinsics_say(shared):
+    folder = shared / "real/sunrgbd/img_0063"
+    full, cut = (cv2.imread(str(folder / part / "img_0063.jpg")) for part in ("fullres", "image"))
+    _, _, best, _ = cv2.minMaxLoc(cv2.matchTemplate(full, cut, cv2.TM_SQDIFF))
+    assert best == (40, 44)
+    whole = sunrgbd.read_intrinsics(folder / "fullres/intrinsics.txt", full.shape[:2])
+    camera = sunrgbd.load_frame(folder, "sunrgbd", "a").camera
+    counted_from_0 = whole.cx - 1, whole.cy - 1
+    assert (counted_from_0[0] - best[0], counted_from_0[1] - best[1]) == pytest.approx((camera.cx, camera.cy))
+
+
+def test_pair_of_loose_files_is_read_with_intrinsics(shared):
+    folder = shared / "real/sunrgbd/open3d_sample"
+    scene = sunrgbd.load_pair(
+        folder / "SUN_color.jpg", folder / "SUN_depth.png", "sunrgbd", "sample", (570, 570, 320, 240)
+    )
+    assert scene.depth.nan_to_num(0).max().item() == 9.870  # beyond 8 m, not cut
+
+
+def test_scenes_behind_links_are_found_and_circular_links_are_harmless(tmp_path):
+    for part in ("image", "depth"):
+        (tmp_path / "elsewhere" / "one" / part).mkdir(parents=True)
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "linked").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / "back").symlink_to(root)
+    assert list(sunrgbd.find_frames(root)) == ["linked/one"]
