@@ -1,11 +1,10 @@
 """Middlebury's formats: on files written here byte by byte, and on real ones."""
 
-import struct
-
 import cv2
 import numpy as np
 import pytest
 import torch
+from data_set_files import pfm
 
 from dsr.data.middlebury import find_2014, find_levels, load_2014, load_levels
 
@@ -25,21 +24,14 @@ def levels(path, values):
     cv2.imwrite(str(path), np.asarray(values, np.uint8))
 
 
-def pfm(path, rows):
-    """Write rows of floats, the first one on top, as Middlebury does: bottom row first, little endian."""
-    height, width = len(rows), len(rows[0])
-    body = b"".join(struct.pack(f"<{width}f", *row) for row in reversed(rows))
-    path.write_bytes(f"Pf\n{width} {height}\n-0.003922\n".encode() + body)
-
-
 @pytest.fixture
 def scene_2014(tmp_path):
     folder = tmp_path / "Recycle-perfect"
     picture(folder / "im0.png", 4, 6, 51)
     (folder / "calib.txt").write_text(CALIBRATION)
-    rows = [[10.0 + 10 * row + column for column in range(6)] for row in range(4)]
-    rows[1][2] = float("inf")
-    pfm(folder / "disp0.pfm", rows)
+    disparity = 10.0 + 10 * np.arange(4)[:, None] + np.arange(6)
+    disparity[1, 2] = 0
+    (folder / "disp0.pfm").write_bytes(pfm(disparity))
     return folder
 
 
@@ -129,26 +121,25 @@ def test_terraces_become_slopes_unless_requested(tmp_path, smooth):
     assert bool((steps != 0).all()) is smooth
 
 
-def test_damaged_levels_are_refused_in_one_line(tmp_path):
+@pytest.mark.parametrize(
+    ("height", "shift", "message"),
+    [
+        (700, "0", "view1.png: expected 700 x 40 pixels"), (370, "many", "dmin.txt: dmin: expected a number, got many"),
+        (200, "0", "disp1.png: expected a height near 1110, a half or a third, got 200"),
+    ],
+)  # fmt: skip
+def test_levels_that_do_not_fit_are_refused_in_one_line(tmp_path, height, shift, message):
     picture(tmp_path / "Aloe" / "view1.png", 370, 40)
+    levels(tmp_path / "Aloe" / "disp1.png", np.ones((height, 40)))
+    (tmp_path / "Aloe" / "dmin.txt").write_text(shift)
+    with pytest.raises(ValueError, match=message):
+        load_levels(find_levels(tmp_path)["aloe"], "middlebury2006", "aloe", 2006)
 
-    def message():
-        with pytest.raises(ValueError, match="Aloe") as refusal:
-            load_levels(find_levels(tmp_path)["aloe"], "middlebury2006", "aloe", 2006)
-        return str(refusal.value)
 
-    assert "disp1.png: expected a picture, there is none" in message()
-    levels(tmp_path / "Aloe" / "disp1.png", np.zeros((370, 40)))
-    assert "disp1.png: expected at least one known disparity, all are unknown" in message()
-    levels(tmp_path / "Aloe" / "disp1.png", np.ones((700, 40)))
-    assert "view1.png: expected 700 x 40 pixels" in message()
-    levels(tmp_path / "Aloe" / "disp1.png", np.ones((200, 40)))
-    assert "disp1.png: expected a height near 1110, a half or a third, got 200" in message()
-    cv2.imwrite(str(tmp_path / "Aloe" / "disp1.png"), np.ones((370, 40), np.uint16))
-    assert "disp1.png: expected one channel of 8 bits, got uint16" in message()
-    levels(tmp_path / "Aloe" / "disp1.png", np.ones((370, 40)))
-    (tmp_path / "Aloe" / "dmin.txt").write_text("many")
-    assert "dmin.txt: dmin: expected a number, got many" in message()
+def test_disparity_that_no_camera_sees_is_refused(scene_2014):
+    (scene_2014 / "disp0.pfm").write_bytes(pfm(np.full((4, 6), 1.0)).replace(b"\x00\x00\x80\x3f", b"\x00\x00\xc0\xc0"))
+    with pytest.raises(ValueError, match=r"disp0\.pfm: expected disparities above -5 pixels, got -6"):
+        load_2014(scene_2014, "middlebury", "recycle")
 
 
 def test_real_scenes_of_2014_are_read(shared):
