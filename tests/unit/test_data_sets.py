@@ -46,7 +46,7 @@ def test_frames_are_found_from_a_directory_above_and_need_all_their_files(kind, 
         with pytest.raises(ValueError, match=f"expected .* got [01] of {kind.count} scenes; .*scenes=found"):
             opened(kind, tmp_path, scenes=None)
     for key in {"split", "sensor", "benchmark"} & kind.make.__init__.__annotations__.keys():
-        with pytest.raises(ValueError, match=f"{key}: expected one of .*, got nosuch"):
+        with pytest.raises(ValueError, match=f"{key}: expected one of .*, got 'nosuch'"):
             opened(kind, tmp_path, **{key: "nosuch"})
     (tmp_path / list(kind.files)[-1]).unlink()
     with pytest.raises(ValueError, match=r"no scene of it|expected .*, (there is none|got 0)"):
