@@ -279,12 +279,6 @@ def _checkpoint(place: Place) -> None:
     SuperResolution.load_from_checkpoint(path)
 
 
-def _notes(place: Place) -> None:
-    from dsr.data.download.fetching import _read_note  # noqa: PLC0415
-
-    _read_note(place.input / "a.png.part", "https://localhost/a.png")
-
-
 def _foreground(place: Place) -> None:
     from dsr.methods.classical.shape_from_shading import read_foreground  # noqa: PLC0415
 
@@ -415,7 +409,6 @@ READERS = (
     Reader("train resume", run_seeds.interrupted_training, _resume, 1),
     Reader("train weights", run_seeds.training_without_weights, _resume, 1),
     Reader("checkpoint", run_seeds.training, _checkpoint, 2),
-    Reader("notes", run_seeds.notes, _notes),
     Reader("foreground", seeds.foreground, _foreground),
     Reader("view", run_seeds.results,
            lambda place: command("view", place.input / "out", "--no-open", "-o", place.out / "view.html")),

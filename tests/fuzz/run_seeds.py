@@ -104,11 +104,6 @@ def interrupted_training(folder: Path) -> None:
     shutil.copytree(_trained(1), folder / "run")
 
 
-def notes(folder: Path) -> None:
-    """Write what an interrupted download leaves."""
-    written(folder / "a.png.part.json", json.dumps({"url": "https://localhost/a.png", "mark": '"1"', "total": 100}))
-
-
 def results(folder: Path) -> None:
     """Write two results of a sequence."""
     for number in range(2):

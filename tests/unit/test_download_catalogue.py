@@ -5,9 +5,7 @@ from collections import Counter
 from pathlib import PurePosixPath
 from urllib.parse import urlsplit
 
-from dsr.data.download.collections import CATALOGUE, EVALUATION_2014
-from dsr.data.middlebury import EVALUATION_2014 as EVALUATED
-from dsr.data.middlebury import SCENES
+from dsr.data.download.collections import CATALOGUE
 
 ITEMS = [item for collection in CATALOGUE.values() for item in collection.items]
 
@@ -62,10 +60,3 @@ def test_files_of_a_commit_are_pinned_and_the_shared_ones_are_these(shared):
             folder, _, name = path.partition("/")
             if folder == ours:
                 assert hashlib.sha256((shared / theirs / name).read_bytes()).hexdigest() == digest
-
-
-def test_catalogue_scenes_are_those_that_the_readers_expect():
-    assert {name.lower() for name in EVALUATION_2014} == set(EVALUATED)
-    for year, scenes in SCENES.items():
-        folders = {item.path.split("/")[1].lower() for item in CATALOGUE[f"middlebury{year}"].items}
-        assert folders == set(scenes)

@@ -127,25 +127,3 @@ def test_damaged_matrices_are_refused_in_one_line(tmp_path, capfd, damage):
     assert refused(lambda: load_matrices(path, "ibims", "a"), path, capfd).startswith("expected a MATLAB file")
     path.unlink()
     assert refused(lambda: load_matrices(path, "ibims", "a"), path, capfd).startswith("expected a MATLAB file")
-
-
-@pytest.mark.parametrize(
-    ("which", "content", "message"),
-    [
-        (0, b"", "expected a picture"),
-        (0, png(RGB[1:]), "expected 480 x 640 pixels"),
-        (1, png(RGB[..., 0]), "expected one channel of 16 bits"),
-        (1, png(LEVELS[:, 1:]), "expected 480 x 640 pixels"),
-        (1, png(LEVELS * 0), "expected at least one known pixel, all are holes"),
-        (2, b"560.5,561.25,321", "expected fx,fy,cx,cy, got '560.5,561.25,321'"),
-        (2, b"560.5,561.25,321,centre", "expected fx,fy,cx,cy, got"),
-        (2, b"560.5,561.25,3210,239.5", "expected fx 0 cx 0 fy cy 0 0 1 of a 480 x 640 picture"),
-        (3, png(LEVELS), "expected one channel of 8 bits"),
-        (5, png(MASKS["edges"][1:]), "expected 480 x 640 pixels"),
-        (8, b"text", "expected a picture"),
-    ],
-)
-def test_pictures_that_do_not_fit_are_refused_in_one_line(tmp_path, capfd, which, content, message):
-    files = pictures(tmp_path)
-    files[which].write_bytes(content)
-    assert re.match(message, refused(lambda: load_pictures(*files, "ibims", "a"), files[which], capfd))

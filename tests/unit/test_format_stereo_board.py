@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from refusals import refused
 from small_files import encoded_png as png
 from small_files import written
 
@@ -22,17 +21,6 @@ def frame(root, name="14", suffix="png"):
     measured = MEASURED.copy()
     measured[0, 0] = 0
     return written(root / f"color/{name}.{suffix}", PHOTO), written(root / f"depth/{name}.png", png(measured))
-
-
-def test_measured_map_is_metres_and_nothing_is_known_beside_the_board(tmp_path):
-    scene = load_frame(*frame(tmp_path), "14", "stereo_board", "14")
-    assert (scene.camera, list(scene.measured)) == (CAMERA, [1])
-    assert scene.measured[1].isnan().nonzero().tolist() == [[0, 0, 0]]
-    assert scene.measured[1][0, 10, 20].item() == pytest.approx(1.010)
-    outline = np.array(BOARDS["14"].outline)
-    known = scene.depth[0].isfinite().nonzero().numpy()
-    low, high = known.min(axis=0), known.max(axis=0)
-    np.testing.assert_allclose([low[::-1], high[::-1]], [outline.min(axis=0), outline.max(axis=0)], atol=1)
 
 
 @pytest.mark.parametrize("name", BOARDS)
@@ -73,14 +61,6 @@ def test_frames_are_those_of_the_boards(tmp_path):
     assert StereoBoard(str(tmp_path), "found").scenes() == ["8", "31"]
     with pytest.raises(ValueError, match=r"dataset=stereo_board: expected 14, 19, 25 in .* got 2 of 5 scenes"):
         StereoBoard(str(tmp_path))
-
-
-@pytest.mark.parametrize("which", range(2))
-@pytest.mark.parametrize("content", [b"", b"text", png(MEASURED)[:999], png(MEASURED[1:]), None])
-def test_damaged_or_missing_file_is_refused_in_one_line_that_names_it(tmp_path, capfd, which, content):
-    files = frame(tmp_path)
-    files[which].unlink() if content is None else files[which].write_bytes(content)
-    assert refused(lambda: load_frame(*files, "14", "stereo_board", "14"), files[which], capfd).startswith("expected ")
 
 
 def test_real_frames_have_the_planes_that_were_measured(shared):

@@ -202,7 +202,7 @@ def test_matrix_larger_than_its_file_can_hold_is_refused_before_it_is_read(tmp_p
     path = tmp_path / "a.mat"
     with h5py.File(path, "w") as file:
         file.create_dataset("intensity", shape=(10**6, 10**6), dtype="f8", chunks=(100, 100))
-    assert "intensity has 1000000000000, expected at most" in refused(lambda: read_matrices(path), path, capfd)
+    assert "intensity have 1000000000000 elements" in refused(lambda: read_matrices(path), path, capfd)
     old(path, {"intensity": GREY})
     content = path.read_bytes()
     size = struct.pack("<ii", *SIZE)

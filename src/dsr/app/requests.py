@@ -240,7 +240,6 @@ class DataVerifyRequest(Options):
     """Check every file against its recorded size and checksum."""
 
     names: tuple[str, ...] = option(..., _NAME_OF_DATA, "NAME", flags="names")
-    accept_changed: bool = option(False, "take files whose checksum differs from the recorded one")
 
 
 @dataclass(frozen=True, kw_only=True)

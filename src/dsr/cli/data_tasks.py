@@ -17,7 +17,7 @@ from dsr.app.requests import (
     DataWhereRequest,
 )
 from dsr.data.download.collections import CATALOGUE, Collection, Item, find
-from dsr.data.download.fetching import Server, absent, checksums_of, get, state, verify
+from dsr.data.download.fetching import absent, checksums_of, expect_address, get, state, verify
 from dsr.methods import weights
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import data_root
@@ -89,7 +89,7 @@ def get_data_sets(request: DataGetRequest, console: Console, catalogue: Mapping[
     """Show what will be downloaded and its licence, ask for confirmation on a terminal, and download it."""
     collections = find(request.names, catalogue)
     if request.mirror is not None:
-        Server.of(request.mirror)  # is checked before anything is shown
+        expect_address(request.mirror)  # before anything is shown
     root, progress = data_root(), ConsoleProgress(console)
     items = {item.path: item for collection in collections for item in collection.items}
     missing = len(absent(items.values(), root))
@@ -99,11 +99,11 @@ def get_data_sets(request: DataGetRequest, console: Console, catalogue: Mapping[
         show(console, f"{missing} of {len(items)} files are missing in {root.absolute()}")
     if missing and not request.yes and sys.stdin.isatty() and console.is_terminal and not _agreed(console):
         return []
-    given = {name: getattr(request, name) for name in ("mirror", "accept_changed", "keep_archives")}
+    given = {"mirror": request.mirror, "keep_archives": request.keep_archives}
     problems = get(items.values(), root, progress, **given) if items else []
     for collection in collections:
         if not collection.items:
-            problems += verify(collection, root, progress, accept_changed=request.accept_changed)
+            problems += verify(collection, root, progress)
     if not problems:
         show(console, f"{', '.join(collection.name for collection in collections)}: complete")
     return problems
@@ -133,7 +133,7 @@ def verify_data_sets(request: DataVerifyRequest, console: Console, catalogue: Ma
     """Check collections, and show which are complete."""
     problems, progress = [], ConsoleProgress(console)
     for collection in find(request.names, catalogue):
-        found = verify(collection, data_root(), progress, accept_changed=request.accept_changed)
+        found = verify(collection, data_root(), progress)
         if not found:
             show(console, f"{collection.name}: complete, as recorded")
         elif collection.items:

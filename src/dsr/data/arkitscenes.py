@@ -23,11 +23,9 @@ import re
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 
 from dsr.data.frame_files import (
-    expect_choice,
     expect_size,
     find_beside,
     given_camera,
@@ -41,6 +39,7 @@ from dsr.geometry.camera import ASSUMED_FOV, Camera
 from dsr.io.captures.arkit import find_intrinsics
 from dsr.io.images import read_levels, read_numbers
 from dsr.sample import Scene
+from dsr.utils.guards import expect_one_of
 
 Split = Literal["validation", "training"]
 SPLITS: tuple[Split, ...] = ("validation", "training")
@@ -51,11 +50,7 @@ Files = tuple[Path, Path, Path, Path | None, Path | None]
 
 
 def find_frames(root: Path, split: Split | None = None) -> dict[str, Files]:
-    """Return the first five arguments of :func:`load_frame` by name "41069021_305.244", in order.
-
-    ``root`` may be any directory above or below ``Training`` and ``Validation``; what is in no ``Training`` is for
-    validation.
-    """
+    """Return the files of frames by name "41069021_305.244", in order; what is in no ``Training`` is for validation."""
     found: dict[str, Files] = {}
     for folder in ("wide", "color"):
         others = ("highres_depth/{}.png", "lowres_depth/{}.png")
@@ -79,19 +74,18 @@ def load_frame(
     *,
     min_confidence: int = 0,
 ) -> Scene:
-    """Return one frame with the lidar's map as the measured one.
-
-    Without ``intrinsics_path``, 60 degrees of horizontal view are assumed. Pixels of the lidar below ``min_confidence``
-    become holes.
-    """
+    """Return one frame with the lidar's map as the measured one, with holes below ``min_confidence``."""
     rgb, depth = read_frame(rgb_path, depth_path, size=_SIZE)
     measured = read_millimetres(measured_path)
     expect_size(measured_path, measured, _SIZE_LR)
     if min_confidence > 0:
         if confidence_path is None:
             raise ValueError(f"{measured_path}: expected its confidence in the folder confidence, there is none")
-        uncertain = torch.from_numpy(read_confidence(confidence_path) < min_confidence)
-        measured = measured.masked_fill(uncertain, torch.nan)
+        confidence = read_levels(confidence_path)
+        expect_size(confidence_path, confidence, _SIZE_LR)
+        if confidence.max() > _HIGHEST_CONFIDENCE:
+            raise ValueError(f"{confidence_path}: expected confidence from 0 to 2, got {confidence.max()}")
+        measured = measured.masked_fill(torch.from_numpy(confidence < min_confidence), torch.nan)
         if not measured.isfinite().any():
             raise ValueError(f"{confidence_path}: expected a pixel of confidence {min_confidence}, there is none")
     height, width = _SIZE
@@ -99,15 +93,6 @@ def load_frame(
     if intrinsics_path is not None:
         camera = read_intrinsics(intrinsics_path)
     return Scene(dataset, name, rgb, camera, depth, {width / _SIZE_LR[1]: measured})
-
-
-def read_confidence(path: Path) -> np.ndarray:
-    """Return the lidar's confidence, (192, 256) uint8 from 0 to 2."""
-    confidence = read_levels(path)
-    expect_size(path, confidence, _SIZE_LR)
-    if confidence.max() > _HIGHEST_CONFIDENCE:
-        raise ValueError(f"{path}: expected confidence from 0 to {_HIGHEST_CONFIDENCE}, got {confidence.max()}")
-    return confidence
 
 
 def read_intrinsics(path: Path) -> Camera:
@@ -121,13 +106,16 @@ def read_intrinsics(path: Path) -> Camera:
 NOTE = f"there is no .pincam file: {ASSUMED_FOV:g} degrees of horizontal view are assumed"
 
 
+DETECTED = ((find_frames, load_frame, "arkitscenes"),)
+
+
 class ARKitScenes(FrameSet):
     """Frames of ARKitScenes for depth upsampling (Baruch et al., NeurIPS 2021) at their own size, 1920 x 1440."""
 
     def __init__(
         self, root: str, split: Split = "validation", scenes: SceneSelection = None, min_confidence: int = 0
     ) -> None:
-        expect_choice("split", split, SPLITS)
+        expect_one_of("split", split, SPLITS)
         if min_confidence not in range(3):
             raise ValueError(f"min_confidence: expected 0, 1 or 2, got {min_confidence}")
         find = functools.partial(find_frames, split=split)

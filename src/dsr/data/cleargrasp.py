@@ -43,12 +43,10 @@ import torch
 from torch import Tensor
 
 from dsr.data.frame_files import (
-    expect_choice,
     expect_size,
     given_camera,
     in_natural_order,
     name_of,
-    read_bytes,
     read_picture,
     to_depth,
     walk,
@@ -60,6 +58,7 @@ from dsr.geometry.camera import Camera
 from dsr.io.depth_files import read_depth_file
 from dsr.io.images import read_mask
 from dsr.sample import Scene
+from dsr.utils.guards import expect_one_of, read_text
 
 Split = Literal["val", "test", "train"]
 SPLITS: tuple[Split, ...] = ("val", "test", "train")
@@ -75,10 +74,7 @@ _ENTRY = re.compile(rf"^({'|'.join(_KEYS)})\s*:\s*([-+.\deE]+)\s*(?:#.*)?$", re.
 
 
 def find_captures(root: Path, split: Split | None = None) -> dict[str, tuple[Path, ...]]:
-    """Return the first arguments of :func:`load_capture` by name "real-val/d435/000000080", in order.
-
-    The name of a folder of a split, or of one above it, ends in the split's.
-    """
+    """Return the files of captures by name "real-val/d435/000000080", in order."""
     found = {}
     for folder, _, files in walk(root):
         if "camera_intrinsics.yaml" in files and _is_of(folder, split):
@@ -91,7 +87,7 @@ def find_captures(root: Path, split: Split | None = None) -> dict[str, tuple[Pat
 
 
 def find_renderings(root: Path, split: Split | None = None) -> dict[str, tuple[Path, ...]]:
-    """Return the first arguments of :func:`load_rendering` by name "square-plastic-bottle-val/000000000", in order."""
+    """Return the files of renderings by name "square-plastic-bottle-val/000000000", in order."""
     found = {}
     for folder, below, _ in walk(root):
         if {each.partition("/")[0] for each in _SYNTHETIC} <= set(below) and _is_of(folder, split):
@@ -104,7 +100,7 @@ def find_renderings(root: Path, split: Split | None = None) -> dict[str, tuple[P
 
 
 def _is_of(folder: Path, split: Split | None) -> bool:
-    """Return whether a folder belongs to a split."""
+    """Return whether a folder, or one above it, has a name that ends in that of a split."""
     return split is None or any(part.endswith(f"-{split}") for part in folder.resolve().parts)
 
 
@@ -127,16 +123,11 @@ def load_rendering(rgb_path: Path, depth_path: Path, mask_path: Path, dataset: s
     expect_size(depth_path, stored, (height, width))
     fx, fy = (size / 2 / math.tan(angle / 2) for size, angle in zip((width, height), VIEW, strict=True))
     camera = Camera(width, height, fx, fy, (width - 1) / 2, (height - 1) / 2)
-    depth = stored * orthogonal(camera)
-    return Scene(dataset, name, rgb, camera, depth, regions=read_regions(mask_path, (height, width)))
-
-
-def orthogonal(camera: Camera) -> Tensor:
-    """Return the factors from the stored depth of a rendered picture to orthogonal depth, (1, H, W) float64."""
-    columns, rows = torch.arange(camera.width, dtype=torch.float64), torch.arange(camera.height, dtype=torch.float64)
-    across, down = (columns / camera.width - 0.5) * VIEW[0], (rows / camera.height - 0.5) * VIEW[1]
+    columns, rows = torch.arange(width, dtype=torch.float64), torch.arange(height, dtype=torch.float64)
+    across, down = (columns / width - 0.5) * VIEW[0], (rows / height - 0.5) * VIEW[1]
     product = across.cos() * down.cos()[:, None]
-    return 1 / (product * camera.rays().double().norm(dim=0))[None]
+    depth = stored * (1 / (product * camera.rays().double().norm(dim=0))[None])
+    return Scene(dataset, name, rgb, camera, depth, regions=read_regions(mask_path, (height, width)))
 
 
 def read_depth(path: Path, *, smooth: bool = False) -> Tensor:
@@ -166,8 +157,7 @@ def read_regions(path: Path, size: Sequence[int]) -> dict[str, Tensor]:
 
 def read_camera(path: Path) -> Camera:
     """Return the camera of a ``camera_intrinsics.yaml``, pixel centres at integers."""
-    text = read_bytes(path, f"a text file with {', '.join(_KEYS)}").decode("utf-8", "replace")
-    found = dict(_ENTRY.findall(text))
+    found = dict(_ENTRY.findall(read_text(path)))
     try:
         width, height, *intrinsics = (float(found[key]) for key in _KEYS)
     except (KeyError, ValueError) as error:
@@ -175,21 +165,17 @@ def read_camera(path: Path) -> Camera:
     return given_camera(intrinsics, (round(height), round(width)), path)
 
 
+DETECTED = ((find_captures, load_capture, "cleargrasp"), (find_renderings, load_rendering, "cleargrasp_synthetic"))
+
+
 class ClearGrasp(FrameSet):
-    """Captures or renderings of ClearGrasp at their own size.
-
-    Args:
-        split: ``val``, with the objects that the authors' networks were trained on; ``test``, with others; ``train``,
-            rendered, to train on; None for what is in ``root``.
-
-    """
+    """Captures or renderings of ClearGrasp at their own size."""
 
     note = NOTE
     regions = ("glass", "outside", "edges")
 
     def __init__(self, root: str, synthetic: bool, split: Split | None = None, scenes: SceneSelection = None) -> None:
-        if split is not None:
-            expect_choice("split", split, SPLITS, ", or null")
+        expect_one_of("split", split, (*SPLITS, None))
         name, load = ("cleargrasp_synthetic", load_rendering) if synthetic else ("cleargrasp", load_capture)
         find = functools.partial(find_renderings if synthetic else find_captures, split=split)
         super().__init__(name, root, find, load, scenes)

@@ -26,10 +26,7 @@ _PHOTO = re.compile(r"(.+)\.png")
 
 
 def find_frames(root: Path) -> dict[str, tuple[Path, Path, Path]]:
-    """Return photos, sensor's and true depth, the first arguments of :func:`load_frame`, by name, in order.
-
-    A name is the frame's group below ``root`` and its file's name, such as ``20170907/group1/frame_000001``.
-    """
+    """Return photos, sensor's and true depth by name "20170907/group1/frame_000001", in order."""
     found = {}
     others = ("depth_map/{}.png", "high_quality_depth/{}.png")
     for place, frame, (photo, measured, truth) in find_beside(root, "color_map", _PHOTO, others):
@@ -41,6 +38,9 @@ def load_frame(rgb_path: Path, measured_path: Path, truth_path: Path, dataset: s
     """Return one frame with the sensor's map, measured at the photo's size."""
     rgb, measured, truth = read_frame(rgb_path, measured_path, truth_path, size=(CAMERA.height, CAMERA.width))
     return Scene(dataset, name, rgb, CAMERA, truth, {1: measured})
+
+
+DETECTED = ((find_frames, load_frame, "ddrnet"),)
 
 
 class DDRNetFrames(FrameSet):

@@ -1,67 +1,27 @@
-"""Detection of the scenes in a directory of any layout that dsr reads."""
+"""Detection of the scenes in a directory of any layout that dsr reads.
+
+A module of this package whose frames are detected has ``DETECTED``: for each kind of them, a function that finds their
+files below a directory, by name, one that loads the scene of such files, and the name of the data set.
+"""
 
 from __future__ import annotations
 
 import functools
+import importlib
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+import pkgutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
-from dsr.data import (
-    arkitscenes,
-    cleargrasp,
-    ddrnet_frames,
-    eight_bit,
-    hammer,
-    ibims,
-    icl,
-    middlebury,
-    nyu,
-    rgbdd,
-    sintel,
-    stereo_board,
-    sunrgbd,
-    tartanair,
-    tofmark,
-)
-from dsr.data.download.collections import CATALOGUE
+import dsr.data
+from dsr.data import middlebury, nyu
 from dsr.data.folder import load_scene
-from dsr.data.frame_files import load_pair
+from dsr.data.preparation import Frames
 from dsr.sample import Scene
 from dsr.utils.guards import natural_key
-from dsr.utils.versions import file_hash
 
 Loader = Callable[[], Scene]
 _YEARS = {"view1.png": 2006, "im2.png": 2003, "im2.ppm": 2001}
-
-
-def _boards(folder: Path) -> dict[str, tuple[Path, Path, str]]:
-    """Return the frames of ``stereo_board`` by their checksums: recordings of others have files of the same names."""
-    pinned = {item.sha256 for item in CATALOGUE["stereo_board"].items}
-    return {name: files for name, files in stereo_board.find_frames(folder).items() if file_hash(files[0]) in pinned}
-
-
-_FRAMES: tuple[tuple[Callable[[Path], Mapping[str, tuple[Any, ...]]], Callable[..., Scene], str], ...] = (
-    (icl.find_frames, icl.load_frame, "icl"),
-    (sunrgbd.find_frames, sunrgbd.load_frame, "sunrgbd"),
-    (tartanair.find_frames, tartanair.load_frame, "tartanair"),
-    (sintel.find_frames, sintel.load_frame, "sintel"),
-    (tofmark.find_frames, tofmark.load_frame, "tofmark"),
-    (ddrnet_frames.find_frames, ddrnet_frames.load_frame, "ddrnet"),
-    (rgbdd.find_frames, load_pair, "rgbdd"),
-    (nyu.find_files, nyu.load_files, "nyu"),
-    (arkitscenes.find_frames, arkitscenes.load_frame, "arkitscenes"),
-    (cleargrasp.find_captures, cleargrasp.load_capture, "cleargrasp"),
-    (cleargrasp.find_renderings, cleargrasp.load_rendering, "cleargrasp_synthetic"),
-    (ibims.find_pictures, ibims.load_pictures, "ibims"),
-    (hammer.find_frames, hammer.load_frame, "hammer"),
-    (_boards, stereo_board.load_frame, "stereo_board"),
-    *(
-        (functools.partial(eight_bit.find_frames, dataset=benchmark), eight_bit.load_frame, benchmark)
-        for benchmark in eight_bit.BENCHMARKS
-    ),
-)
 
 
 def find_scenes(folder: Path) -> Iterator[tuple[str, Loader]]:
@@ -77,10 +37,16 @@ def find_scenes(folder: Path) -> Iterator[tuple[str, Loader]]:
         if labelled.is_file():
             for name, arguments in itertools.islice(nyu.find_frames(labelled).items(), 0, None, 100):
                 yield name, functools.partial(nyu.load_frame, *arguments, "nyu", name)
-    for find, load, dataset in _FRAMES:
+    for find, load, dataset in _detected():
         for name, arguments in find(folder).items():
             if not any((path.parent / "camera.json").is_file() for path in arguments if isinstance(path, Path)):
                 yield name, functools.partial(load, *arguments, dataset, name)
+
+
+def _detected() -> Iterator[tuple[Callable[[Path], Frames], Callable[..., Scene], str]]:
+    """Yield what the modules of data sets have in ``DETECTED``."""
+    for module in pkgutil.iter_modules(dsr.data.__path__, "dsr.data."):
+        yield from getattr(importlib.import_module(module.name), "DETECTED", ())
 
 
 def _stereo(place: Path, *, itself: bool) -> Iterator[tuple[str, Loader]]:

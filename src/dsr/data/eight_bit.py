@@ -25,12 +25,13 @@ from typing import Literal
 
 import torch
 
-from dsr.data.frame_files import expect_choice, expect_size, find_beside, in_natural_order, read_picture
+from dsr.data.frame_files import expect_size, find_beside, in_natural_order, read_picture
 from dsr.data.preparation import FrameSet
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera, baseline_times_focal, from_range
 from dsr.io.images import read_levels
 from dsr.sample import Scene, Unit
+from dsr.utils.guards import expect_one_of
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
 
 
 def find_frames(root: Path, dataset: str) -> dict[str, tuple[Path, Path]]:
-    """Return the photos and maps of a benchmark, the first two arguments of :func:`load_frame`, by name, in order."""
+    """Return the photos and maps of a benchmark by name, in order."""
     found: dict[str, tuple[Path, Path]] = {}
     prefix = BENCHMARKS[dataset].prefix
     for spelling in ("output", "ouput"):
@@ -87,6 +88,9 @@ def load_frame(rgb_path: Path, levels_path: Path, dataset: str, name: str) -> Sc
 NOTE = "depth is not metric: the camera is invented, and levels are read as disparity"
 
 
+DETECTED = tuple((functools.partial(find_frames, dataset=each), load_frame, each) for each in BENCHMARKS)
+
+
 class EightBit(FrameSet):
     """Six pairs of Lu et al. (CVPR 2014) or thirty of Middlebury 2001 to 2006, at their own size."""
 
@@ -94,6 +98,6 @@ class EightBit(FrameSet):
     soft_edges = True
 
     def __init__(self, root: str, benchmark: Literal["lu", "middlebury8"], scenes: SceneSelection = None) -> None:
-        expect_choice("benchmark", benchmark, BENCHMARKS)
+        expect_one_of("benchmark", benchmark, BENCHMARKS)
         find = functools.partial(find_frames, dataset=benchmark)
         super().__init__(benchmark, root, find, load_frame, scenes, BENCHMARKS[benchmark].scenes)

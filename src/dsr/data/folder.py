@@ -39,14 +39,7 @@ _MEASURED = re.compile(r"(depth|disparity)_lr(\d*)")
 
 
 class Folder(SceneSource):
-    """The scenes of a directory.
-
-    Args:
-        name: name in ``scores.csv``.
-        without_offset: names of the scenes whose ``doffs`` in ``camera.json`` is replaced by 0, as the paper does with
-            Vintage; see :class:`dsr.data.middlebury.Middlebury`.
-
-    """
+    """The scenes of a directory."""
 
     evaluation = False
 
@@ -94,7 +87,7 @@ def load_scene(folder: Path, dataset: str, *, offset: bool = True) -> Scene:
             raise ValueError(f"{folder / 'camera.json'}: without_offset: expected a doffs to leave out, there is none")
         description = replace(description, camera=replace(description.camera, doffs=0.0))
     camera = description.camera
-    rgb_path = _first(folder, _RGB_NAMES)
+    rgb_path = next((path for path in map(folder.joinpath, _RGB_NAMES) if path.is_file()), folder / _RGB_NAMES[0])
     rgb = read_rgb(rgb_path)
     expect_size(rgb_path, rgb[..., 0], (camera.height, camera.width), ", from camera.json")
     measured: dict[float, Tensor] = {}
@@ -130,11 +123,6 @@ def _read_measured(path: Path, quantity: str, factor: str, description: CameraFi
             f"more pixels, got {height} x {width}"
         )
     return ratio, _read_depth(path, quantity, description, camera_lr)
-
-
-def _first(folder: Path, names: Sequence[str]) -> Path:
-    """Return the first of the files that exists; where none does, the first, so that its reader names it as missing."""
-    return next((folder / name for name in names if (folder / name).is_file()), folder / names[0])
 
 
 def _find_depth_hr(folder: Path) -> Path | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -17,18 +17,11 @@ from torch import Tensor
 from dsr.geometry.camera import ASSUMED_FOV, Camera
 from dsr.io.images import read_pixels
 from dsr.sample import Scene
-from dsr.utils.guards import MOST_FILE, natural_key, read_limited
+from dsr.utils.guards import natural_key
 
 # Note of scenes whose camera is that of Camera.from_fov
 NO_CAMERA = f"no camera is published: {ASSUMED_FOV:g} degrees of horizontal view are assumed"
 Found = TypeVar("Found")
-
-
-def read_bytes(path: Path, what: str) -> bytes:
-    """Return the content of a file."""
-    if not path.is_file():
-        raise ValueError(f"{path}: expected {what}, there is none")
-    return read_limited(path, MOST_FILE)
 
 
 def read_picture(path: Path) -> Tensor:
@@ -115,12 +108,6 @@ def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scen
     rgb, depth = read_frame(rgb_path, depth_path)
     height, width = rgb.shape[1:]
     return Scene(dataset, name, rgb, Camera.from_fov(ASSUMED_FOV, width, height), depth)
-
-
-def expect_choice(key: str, value: object, choices: Collection[object], others: str = "") -> None:
-    """Refuse a value of a setting that is none of its choices; ``others`` names those that are no texts."""
-    if value not in choices:
-        raise ValueError(f"{key}: expected one of {', '.join(map(str, choices))}{others}, got {value}")
 
 
 def walk(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:

@@ -23,11 +23,12 @@ import re
 from pathlib import Path
 from typing import Literal, get_args
 
-from dsr.data.frame_files import expect_choice, find_beside, in_natural_order, read_frame, to_camera
+from dsr.data.frame_files import find_beside, in_natural_order, read_frame, to_camera
 from dsr.data.preparation import FrameSet
 from dsr.data.scene_source import SceneSelection
 from dsr.io.images import read_numbers
 from dsr.sample import Scene
+from dsr.utils.guards import expect_one_of
 
 Sensor = Literal["d435", "tof", "l515"]
 Split = Literal["test", "train"]
@@ -61,6 +62,9 @@ def load_frame(
     return Scene(dataset, name, rgb, camera, truth, {1: measured})
 
 
+DETECTED = ((find_frames, load_frame, "hammer"),)
+
+
 class Hammer(FrameSet):
     """Frames of HAMMER at their own size, a camera's map as measured at x1; ``naked`` are those without objects."""
 
@@ -72,8 +76,8 @@ class Hammer(FrameSet):
         naked: bool = False,
         scenes: SceneSelection = None,
     ) -> None:
-        expect_choice("sensor", sensor, get_args(Sensor))
-        expect_choice("split", split, get_args(Split))
+        expect_one_of("sensor", sensor, get_args(Sensor))
+        expect_one_of("split", split, get_args(Split))
         find = functools.partial(find_frames, sensor=sensor, split=split, naked=naked)
         super().__init__("hammer", root, find, load_frame, scenes)
         self.evaluation = split == "test"

@@ -32,7 +32,6 @@ from dsr.data.frame_files import (
     find_beside,
     in_natural_order,
     read_16bit,
-    read_bytes,
     read_picture,
     to_camera,
     to_depth,
@@ -44,6 +43,7 @@ from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
 from dsr.io.images import read_levels
 from dsr.sample import Scene
+from dsr.utils.guards import read_text
 
 COUNT = 100  # number of scenes
 SIZE = (480, 640)
@@ -56,10 +56,7 @@ Pictures = tuple[Path, Path, Path, *tuple[Path | None, ...]]
 
 
 def find_matrices(root: Path) -> dict[str, tuple[Path]]:
-    """Return the MATLAB files of scenes, the first argument of :func:`load_matrices`, by name, in order.
-
-    Results of methods, ``*_results.mat``, are left out.
-    """
+    """Return the MATLAB files of scenes by name, in order, without results of methods, ``*_results.mat``."""
     found: dict[str, tuple[Path]] = {}
     for folder, _, files in walk(root):
         names = (file.removesuffix(".mat") for file in files if file.endswith(".mat"))
@@ -107,7 +104,7 @@ def load_pictures(rgb_path: Path, depth_path: Path, calibration_path: Path, *pat
     expect_size(rgb_path, rgb, SIZE)
     for path, image in ((depth_path, depth), *((given[key], mask) for key, mask in masks.items())):
         expect_size(path, image, SIZE)
-    text = read_bytes(calibration_path, "a text file of fx,fy,cx,cy").decode("utf-8", "replace")
+    text = read_text(calibration_path)
     try:
         fx, fy, cx, cy = map(float, text.replace(",", " ").split())
     except ValueError as error:
@@ -135,6 +132,9 @@ def _scene(
     regions = {"planes": planes.astype(np.uint8), "edges": (masks.get("edges", np.zeros(SIZE)) > 0).astype(np.uint8)}
     found = {key: torch.from_numpy(region)[None] for key, region in regions.items() if region.any()}
     return Scene(dataset, name, rgb, camera, truth, regions=found)
+
+
+DETECTED = ((find_pictures, load_pictures, "ibims"),)
 
 
 class IBims(PreparedDataset):

@@ -36,11 +36,7 @@ _SIZE = (480, 640)
 
 
 def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
-    """Return colour and depth files, the first two arguments of :func:`load_frame`, by name, in order.
-
-    A name is the frame's folder below ``root`` and its number, such as ``living_room_traj2/0120``, or the folder alone
-    where it holds one frame. A frame that lacks one of its two files is left out.
-    """
+    """Return colour and depth files by name "living_room_traj2/0120", or the folder's if it holds one frame."""
     found: dict[str, tuple[Path, Path]] = {}
     for folder, below, files in walk(root):
         if "rgb" in below and "depth" in below:
@@ -88,6 +84,9 @@ FRAMES = MappingProxyType(
         "displays": "office_room_traj2/0300",
     }
 )
+
+
+DETECTED = ((find_frames, load_frame, "icl"),)
 
 
 class ICL(FrameSet):

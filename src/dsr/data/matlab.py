@@ -9,7 +9,6 @@ import math
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,26 +36,15 @@ def read_variables(path: Path) -> dict[str, np.ndarray]:
     try:
         if h5py.is_hdf5(path):
             with h5py.File(path, "r") as file:
-                return dict(_matrices("", file, _Budget(_LARGEST)))
-        content = memoryview(read_limited(path, 8 * _LARGEST))
-        return dict(_matrices("", _old_variables(content), _Budget(_LARGEST)))
+                stored = _few_matrices(file)
+                for array in stored.values():
+                    expect_own_values(array)
+                return {name: array[()].T for name, array in stored.items()}
+        return _few_matrices(_old_variables(memoryview(read_limited(path, 8 * _LARGEST))))
     except Exception as error:  # a damaged file makes h5py raise RuntimeError, OSError, KeyError, ..., zlib its own
         raise ValueError(
             f"{path}: expected a MATLAB file, got a damaged or foreign one ({one_line(error):.80})"
         ) from error
-
-
-@dataclass
-class _Budget:
-    """How many elements may still be read."""
-
-    left: int
-
-    def take(self, name: str, count: int) -> None:
-        """Take some of them, or raise ValueError."""
-        if count > self.left:
-            raise ValueError(f"{name} has {count}, expected at most {self.left}")
-        self.left -= count
 
 
 def _old_variables(content: memoryview) -> dict[str, Any]:
@@ -123,8 +111,18 @@ def _elements(content: memoryview, order: str) -> Iterator[tuple[int, memoryview
         yield kind, content[start : start + length]
 
 
-def _matrices(prefix: str, entries: Mapping[str, Any], budget: _Budget) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the matrices of numbers in a file or structure, axes as in MATLAB."""
+def _few_matrices(entries: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the matrices of a file; more elements than expected are refused."""
+    found = _matrices("", entries)
+    count = sum(each.size for each in found.values())
+    if count > _LARGEST:
+        raise ValueError(f"{', '.join(found)} have {count} elements, expected at most {_LARGEST}")
+    return found
+
+
+def _matrices(prefix: str, entries: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the matrices of numbers in a file or structure; those of HDF5 are not read yet, their axes reversed."""
+    found: dict[str, Any] = {}
     for key in entries:
         if key.startswith("#"):  # MATLAB's own tables
             continue
@@ -132,9 +130,7 @@ def _matrices(prefix: str, entries: Mapping[str, Any], budget: _Budget) -> Itera
             raise ValueError(f"{prefix}{key} is a link")
         entry = entries[key]
         if isinstance(entry, Mapping):
-            yield from _matrices(f"{prefix}{key}.", entry, budget)
+            found |= _matrices(f"{prefix}{key}.", entry)
         elif isinstance(entry, np.ndarray | h5py.Dataset) and entry.dtype.kind in "biuf" and entry.ndim in (2, 3):
-            budget.take(prefix + key, entry.size)
-            if isinstance(entry, h5py.Dataset):
-                expect_own_values(entry)
-            yield prefix + key, entry if isinstance(entry, np.ndarray) else entry[()].T
+            found[prefix + key] = entry
+    return found

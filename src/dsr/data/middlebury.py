@@ -32,7 +32,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.download import collections
+from dsr.data.download.collections import CATALOGUE
 from dsr.data.frame_files import expect_size, read_picture
 from dsr.data.preparation import Preparation, PreparedDataset, SceneRecord
 from dsr.data.reference_depth import smooth_levels
@@ -40,12 +40,11 @@ from dsr.data.scene_source import WITHOUT_OFFSET, SceneSelection
 from dsr.geometry.camera import Camera, from_range
 from dsr.io.images import read_levels, read_map
 from dsr.sample import Scene
-from dsr.utils.guards import naming, natural_key, numbers_in, read_limited
+from dsr.utils.guards import naming, natural_key, numbers_in, read_text
 
 _MATRIX = re.compile(r"\[\s*(\S+)\s+0\s+(\S+)\s*;\s*0\s+(\S+)\s+(\S+)\s*;\s*0\s+0\s+1\s*\]")
 _FULL_HEIGHT, _FULL_FOCAL, _BASELINE = 1110, 3740.0, 0.16
 _ASSUMED_SHIFT = 200.0
-_TEDDY = MappingProxyType({"fx": 1500.0, "fy": 1500.0, "baseline": 0.08, "doffs": 52.0, "cx": 199.0, "cy": 187.0})
 _NOISY = MappingProxyType({4: "_depth_2_n.png", 8: "_depth_3_n.png"})
 
 
@@ -109,10 +108,7 @@ def load_2014(folder: Path, dataset: str, name: str, *, offset: bool = True) -> 
 
 
 def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: bool = True) -> Scene:
-    """Return a scene of 2001 to 2006; the year of the data set says how levels count.
-
-    ``smooth`` removes the steps of the rounding, see :mod:`dsr.data.reference_depth`.
-    """
+    """Return a scene of 2001 to 2006; ``smooth`` removes the steps of the rounding to levels."""
     levels = read_levels(files.disparity).astype(np.float64)
     height, width = levels.shape
     camera, per_pixel = _levels_camera(files, year, height, width)
@@ -128,22 +124,9 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
     return Scene(dataset, name, _photo(files.photo, camera), camera, depth, measured)
 
 
-def shortcoming(files: Files, year: int) -> str:
-    """Return why the depth of a scene of 2001 to 2006 is not metric; empty where it is."""
-    if year in (2001, 2003):
-        return "depth is not metric: no camera was published, that of Teddy in the evaluation kit is assumed"
-    return "" if files.shift else "depth is not metric: there is no dmin.txt, the shift of Art is assumed"
-
-
 def read_calibration(path: Path) -> Camera:
-    """Return the left camera of a ``calib.txt``.
-
-    Lines are ``key=value`` with blanks anywhere; ``cam0`` is a matrix as MATLAB writes it, ``baseline`` in millimetres,
-    the rest in pixels.
-    """
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a calibration, there is none")
-    lines = read_limited(path).decode("utf-8", "replace").splitlines()
+    """Return the left camera of a ``calib.txt``: lines ``key=value``, baseline in millimetres, the rest in pixels."""
+    lines = read_text(path).splitlines()
     entries = {key.strip(): value.strip() for key, equals, value in (line.partition("=") for line in lines) if equals}
     matrix = _MATRIX.fullmatch(entries.get("cam0", ""))
     if matrix is None:
@@ -178,46 +161,36 @@ def _depth(path: Path, disparity: np.ndarray, camera: Camera) -> Tensor:
 
 def _levels_camera(files: Files, year: int, height: int, width: int) -> tuple[Camera, float]:
     """Return the camera of a data set of levels at a map's size, and levels per pixel."""
-    if year == 2003:
-        return Camera(width, height, **_TEDDY), 4
     cx, cy = (width - 1) / 2, (height - 1) / 2
-    if year == 2001:
-        return Camera(width, height, **{**_TEDDY, "cx": cx, "cy": cy}), 8
+    if year in (2001, 2003):  # Teddy's
+        camera = Camera(width, height, 1500.0, 1500.0, 199.0, 187.0, 0.08, 52.0)
+        return (camera, 4) if year == 2003 else (replace(camera, cx=cx, cy=cy), 8)
     per_pixel = round(_FULL_HEIGHT / height)
     if per_pixel not in (1, 2, 3):
         raise ValueError(f"{files.disparity}: expected a height near {_FULL_HEIGHT}, a half or a third, got {height}")
     shift = _ASSUMED_SHIFT
     if files.shift is not None:
-        text = read_limited(files.shift).decode("utf-8", "replace").strip()
-        shift = _number(files.shift, "dmin", text)
+        shift = _number(files.shift, "dmin", read_text(files.shift).strip())
     focal = _FULL_FOCAL / per_pixel
     return Camera(width, height, focal, focal, cx, cy, _BASELINE, shift / per_pixel), per_pixel
 
 
-def _names(folders: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of scenes: those of their folders in lower case."""
-    return tuple(name.casefold() for name in folders)
+def _scenes(dataset: str, folder: str) -> tuple[str, ...]:
+    """Return the names of scenes in the catalogue: those of their folders in lower case."""
+    places = (Path(item.path).parent for item in CATALOGUE[dataset].items)
+    names = (place.name.removesuffix("-perfect").casefold() for place in places if place.parent.name == folder)
+    return tuple(dict.fromkeys(names))
 
 
-EVALUATION_2014, TRAINING_2014 = _names(collections.EVALUATION_2014), _names(collections.TRAINING_2014)
-SCENES = {
-    2001: _names(collections.SCENES_2001),
-    2003: _names(collections.SCENES_2003),
-    2005: _names(collections.SCENES_2005),
-    2006: _names(collections.SCENES_2006),
-}
+EVALUATION_2014 = _scenes("middlebury", "middlebury2014")
+TRAINING_2014 = _scenes("middlebury_train", "middlebury2014")
+SCENES = {year: _scenes(f"middlebury{year}", f"middlebury{year}") for year in (2001, 2003, 2005, 2006)}
 TRAINING = {2001: SCENES[2001], 2006: SCENES[2006], 2014: TRAINING_2014}  # scenes to train on by year
 _FILES_2014 = ("im0.png", "calib.txt", "disp0.pfm", "disp0GT.pfm")
 
 
 class Middlebury(PreparedDataset):
-    """Scenes of Middlebury 2014.
-
-    Args:
-        without_offset: names of the scenes whose disparity offset is replaced by 0, which makes their depth wrong. The
-            paper does so with Vintage, but not with Recycle and Playroom.
-
-    """
+    """Scenes of Middlebury 2014; the paper leaves the offset out of Vintage, but not of Recycle and Playroom."""
 
     def __init__(
         self,
@@ -289,13 +262,15 @@ def records_2014(folder: Path, dataset: str, without_offset: Collection[str] = (
 
 
 def records_levels(folder: Path, dataset: str, year: int, *, smooth: bool = True) -> dict[str, SceneRecord]:
-    """Return the records of the scenes of 2001 to 2006 on disk."""
-    return {
-        name: SceneRecord(
-            tuple(path for path in (files.photo, files.disparity, files.shift, *files.measured.values()) if path),
-            functools.partial(load_levels, files, dataset, name, year, smooth=smooth),
-            settings="" if smooth else "terraces",
-            note=shortcoming(files, year),
-        )
-        for name, files in find_levels(folder).items()
-    }
+    """Return the records of the scenes of 2001 to 2006 on disk, with notes of those whose depth is not metric."""
+    records = {}
+    for name, files in find_levels(folder).items():
+        note = ""
+        if year in (2001, 2003):
+            note = "depth is not metric: no camera was published, that of Teddy in the evaluation kit is assumed"
+        elif files.shift is None:
+            note = "depth is not metric: there is no dmin.txt, the shift of Art is assumed"
+        paths = tuple(path for path in (files.photo, files.disparity, files.shift, *files.measured.values()) if path)
+        load = functools.partial(load_levels, files, dataset, name, year, smooth=smooth)
+        records[name] = SceneRecord(paths, load, settings="" if smooth else "terraces", note=note)
+    return records

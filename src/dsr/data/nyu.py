@@ -27,14 +27,14 @@ import h5py
 import numpy as np
 import torch
 
-from dsr.data.frame_files import expect_choice, expect_size, find_beside, in_natural_order, read_picture, to_depth
+from dsr.data.frame_files import expect_size, find_beside, in_natural_order, read_picture, to_depth
 from dsr.data.matlab import expect_own_values
 from dsr.data.preparation import Preparation, PreparedDataset, make_records
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
 from dsr.io.images import read_map
 from dsr.sample import Scene
-from dsr.utils.guards import refusing
+from dsr.utils.guards import expect_one_of, naming, refusing
 
 CAMERA = Camera(640, 480, 518.85790117450188, 519.46961112127485, 325.58244941119034 - 1, 253.73616633400465 - 1)
 BORDER = (44, 40, 427, 561)  # of the window that the projected depth covers: first row and column, height, width
@@ -49,26 +49,17 @@ _FRAME = MappingProxyType({
 
 
 def find_frames(path: Path) -> dict[str, tuple[Path, int]]:
-    """Return the file and the frame's number, the first two arguments of :func:`load_frame`, by name "0001" to "1449".
-
-    Numbers count from 1, as in the official split of the frames.
-    """
+    """Return the file and the frame's number by name "0001" to "1449", as the official split counts."""
     with _opened(path) as arrays:
         return {f"{number:04d}": (path, number) for number in range(1, len(arrays["images"]) + 1)}
 
 
 def load_frame(path: Path, number: int, dataset: str, name: str, *, filled: bool = False, crop: bool = True) -> Scene:
-    """Return a frame by its number from 1, with the Kinect's depth, or the authors' ``filled`` one.
-
-    ``crop`` cuts off the border, which leaves 427 x 561 pixels.
-    """
+    """Return a frame by its number from 1; ``crop`` cuts off the border, which leaves 427 x 561 pixels."""
     key = "depths" if filled else "rawDepths"
-    with _opened(path) as arrays:
-        count = len(arrays["images"])
-        if not 1 <= number <= count:
-            raise ValueError(f"{path}: expected a frame from 1 to {count}, got {number}")
-        with refusing(f"{path}: expected frame {number} of {key} and images, got a damaged file", OSError):
-            pixels, metres = arrays["images"][number - 1], arrays[key][number - 1]
+    damaged = f"{path}: expected frame {number} of {key} and images, got a damaged file"
+    with _opened(path) as arrays, refusing(damaged, OSError):
+        pixels, metres = arrays["images"][number - 1], arrays[key][number - 1]
     rgb = torch.from_numpy(pixels).permute(0, 2, 1).contiguous().float() / 255  # (3, 480, 640)
     depth, camera = to_depth(path, metres.T), CAMERA
     if crop:
@@ -81,10 +72,7 @@ def load_frame(path: Path, number: int, dataset: str, name: str, *, filled: bool
 
 
 def find_files(root: Path) -> dict[str, tuple[Path, Path]]:
-    """Return the photos and depths that lie in files of their own, arguments of :func:`load_files`, by name, in order.
-
-    Names are those of the frames in the labelled file: ``RGB/1000.jpg`` is "1001".
-    """
+    """Return photos and depths in files of their own by the frame's name: ``RGB/1000.jpg`` is "1001"."""
     found: dict[str, tuple[Path, Path]] = {}
     for _, number, (photo, depth) in find_beside(root, "RGB", _PHOTO, ("Depth/{}.npy",)):
         found.setdefault(f"{int(number) + 1:04d}", (photo, depth))
@@ -103,35 +91,29 @@ def load_files(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Sce
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[Mapping[str, h5py.Dataset]]:
     """Open the file and yield its arrays, checked to be as the module says."""
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a MATLAB 7.3 file, there is none")
-    try:
+    size = path.stat().st_size
+    with refusing(f"{path}: expected a MATLAB 7.3 (HDF5) file, got {size} bytes damaged or foreign", OSError):
         file = h5py.File(path, "r")
-    except OSError as error:
-        size = path.stat().st_size
-        raise ValueError(f"{path}: expected a MATLAB 7.3 (HDF5) file, got {size} bytes damaged or foreign") from error
     with file:
         yield {key: _checked(path, file, key) for key in _FRAME}
 
 
 def _checked(path: Path, file: h5py.File, key: str) -> h5py.Dataset:
-    """Return one of the arrays, if it has the shape and type of its frames and as many as the others."""
+    """Return one of the arrays, if it has the shape and type of its frames and as many as the images."""
     shape, dtype = _FRAME[key]
     # damaged inside: h5py raises KeyError, RuntimeError, OSError, ...
     with refusing(f"{path}: expected the array {key}, got a damaged or foreign file", Exception):
-        array = file.get(key)
-        came = (array.dtype, array.shape) if isinstance(array, h5py.Dataset) else None
-        count = file["images"].shape[:1]
-    if came is None:
-        raise ValueError(f"{path}: expected the array {key}, got none of that name")
-    try:
+        array, count = file[key], file["images"].shape[0]
+        came = (array.dtype, array.shape)
+    with naming(f"{path}: expected the array {key}"):
         expect_own_values(array)
-    except ValueError as error:
-        raise ValueError(f"{path}: expected the array {key}, {error}") from error
-    if came != (dtype, (*count, *shape)):
+    if came != (dtype, (count, *shape)):
         sizes = ", ".join(map(str, shape))
         raise ValueError(f"{path}: {key}: expected {dtype} (frames, {sizes}), got {came[0]} {came[1]}")
     return array
+
+
+DETECTED = ((find_files, load_files, "nyu"),)
 
 
 class NYU(PreparedDataset):
@@ -157,7 +139,7 @@ class NYU(PreparedDataset):
             found = make_records(frames, load_frame, "nyu", filled=filled)
             super().__init__("nyu", root, found, scenes, preparation=Preparation(size, crop))
             return
-        expect_choice("split", split, SPLITS, ", or null")
+        expect_one_of("split", split, (*SPLITS, None))
         found = make_records(frames, load_frame, "nyu", filled=True, crop=False)
         found = found or make_records(find_files(folder), load_files, "nyu")
         named = [f"{number:04d}" for number in SPLITS[split]]

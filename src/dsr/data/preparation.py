@@ -75,28 +75,14 @@ def rename_frames(frames: Frames, names: Mapping[str, str]) -> Frames:
     return new | {frame: files for frame, files in old.items() if frame not in replaced}
 
 
-def _files_of(path: Path) -> list[Path]:
-    """Return a file, or the files of a folder and those below it."""
-    return [path] if not path.is_dir() else sorted(file for file in path.rglob("*") if file.is_file())
-
-
 @dataclass(frozen=True)
 class Preparation:
-    """Resizing, cropping and inpainting of scenes after they are read.
+    """Resizing, cropping and inpainting of scenes after they are read."""
 
-    Args:
-        size: length of the shorter side in pixels; None for the original size.
-        crop: position of a square window along the longer side, from 0 (top or left) to 1 (bottom or right); None for
-            no window.
-        enlarge: whether smaller scenes are enlarged.
-        fill: names of the scenes whose holes are inpainted; see :mod:`dsr.data.reference_depth`.
-
-    """
-
-    size: int | None = 512
-    crop: float | None = 0.5
-    enlarge: bool = True
-    fill: tuple[str, ...] = ()
+    size: int | None = 512  # length of the shorter side in pixels; None for the original size
+    crop: float | None = 0.5  # place of a square window along the longer side, 0 (top or left) to 1; None for no window
+    enlarge: bool = True  # whether smaller scenes are enlarged
+    fill: tuple[str, ...] = ()  # names of the scenes whose holes are inpainted
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -119,12 +105,10 @@ class PreparedDataset(SceneSource):
     """A data set in its original format; the base class of those in this package.
 
     Args:
-        name: name in ``scores.csv`` and in ``dsr data get``.
         found: records of the scenes on disk.
-        named: names of the scenes that belong to the data set; None for all that are on disk.
         scenes: names of the scenes to use; None for those of ``named``, ``found`` for all that are on disk.
-        preparation: None for scenes as they are.
-        count: number of scenes that belong to the data set, where their names are not known.
+        named: names of the scenes that belong to the data set; None for all that are on disk.
+        count: number of scenes that belong to the data set, if their names are not known.
 
     """
 
@@ -176,7 +160,7 @@ class PreparedDataset(SceneSource):
 
     def fingerprint(self, scene: str) -> str:
         """Return the SHA-256 of the scene's files and of the settings that they are read and prepared with."""
-        plain = asdict(replace(self._preparation, fill=()))
+        plain = asdict(self._preparation) | {"fill": ()}
         settings = json.dumps([self._found[scene].settings, scene in self._preparation.fill, plain])
         return hashlib.sha256(f"{settings}{self.content(scene)}".encode()).hexdigest()
 
@@ -185,18 +169,10 @@ class PreparedDataset(SceneSource):
         record = self._found[scene]
         digest = hashlib.sha256(record.frame.encode())
         for path in record.files:
-            for file in _files_of(path):
+            files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+            for file in files:
                 digest.update(content_hash(file).encode())
         return digest.hexdigest()
-
-    def unprepared(self, scenes: Sequence[str]) -> list[str]:
-        """Return those of some scenes that are not in the cache."""
-        missing = []
-        for scene in scenes if self._preparation.size is not None else ():
-            with contextlib.suppress(OSError, ValueError):  # loading the scene raises it again
-                if not (cache_directory() / self._path(scene)).is_file():
-                    missing.append(scene)
-        return missing
 
     def prepare(self, scenes: Sequence[str], _: Callable[[str], None] = SILENT.say) -> Iterator[str]:
         """Prepare scenes that are not in the cache, several at a time, and yield the name of each that is ready.
@@ -204,7 +180,11 @@ class PreparedDataset(SceneSource):
         The name of a scene that fails is yielded, too; loading the scene raises the error.
         """
         with ThreadPoolExecutor(min(len(scenes), os.cpu_count() or 1) or 1) as pool:
-            missing = self.unprepared(scenes)
+            missing = []
+            for scene in scenes if self._preparation.size is not None else ():
+                with contextlib.suppress(OSError, ValueError):  # loading the scene raises it again
+                    if not (cache_directory() / self._path(scene)).is_file():
+                        missing.append(scene)
             jobs = {pool.submit(self.load, scene): scene for scene in missing}
             yield from (scene for scene in scenes if scene not in missing)
             try:
@@ -244,19 +224,19 @@ class FrameSet(PreparedDataset):
         return self.note
 
 
-@functools.lru_cache(maxsize=4096)
-def _hash_of(path: Path, size: int, changed: int) -> str:
-    if size > _MAX_HASHED:
-        return f"{path.name} {size} {changed}"
-    return file_hash(path)
-
-
 def content_hash(path: Path) -> str:
     """Return the SHA-256 of a file; of a file above 256 MiB, its name, size and time of the last change."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a file, there is none")
     status = path.stat()
+    if status.st_size > _MAX_HASHED:
+        return f"{path.name} {status.st_size} {status.st_mtime_ns}"
     return _hash_of(path, status.st_size, status.st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=4096)
+def _hash_of(path: Path, _size: int, _changed: int) -> str:
+    return file_hash(path)
 
 
 def _rendering(scene: Scene) -> Rendering:

@@ -15,7 +15,7 @@ from dsr.data.folder import Folder
 from dsr.data.scene_source import SceneSelection, SceneSource, select_scenes
 from dsr.sample import Scene
 from dsr.synthetic.procedural.random_scene import PROCEDURAL_VERSION, render_random_scene
-from dsr.synthetic.rendering import cache_directory, expect_room_for, load_or_render
+from dsr.synthetic.rendering import Rendering, cache_directory, expect_room_for, load_or_render
 from dsr.synthetic.simgeo import SCENES, SCENES_VERSION, render_scene
 from dsr.utils.processes import Pool
 from dsr.utils.progress import SILENT
@@ -24,12 +24,7 @@ _WORTH_WORKERS = 5.0  # seconds of rendering from which worker processes are use
 
 
 class Procedural(SceneSource):
-    """Random scenes number 0 .. ``count`` - 1 of a seed, rendered once and kept in the cache.
-
-    Args:
-        seed: seed of the scenes; each is a pure function of seed, number and size.
-
-    """
+    """Random scenes number 0 .. ``count`` - 1, each a pure function of seed, number and size, kept in the cache."""
 
     name = "procedural"
     evaluation = False
@@ -48,27 +43,18 @@ class Procedural(SceneSource):
 
     def load(self, scene: str) -> Scene:
         """Return one scene."""
-        rendering = load_or_render(self._path(scene), lambda: render_random_scene(self._seed, int(scene), self._size))
-        return rendering.scene(self.name, scene)
+        return self._render(scene).scene(self.name, scene)
 
     def fingerprint(self, scene: str) -> str:
         """Return the version, seed, size and number that determine the scene."""
         return f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}-{scene}"
 
-    def unprepared(self, scenes: Sequence[str]) -> list[str]:
-        """Return those of some scenes that are not in the cache."""
-        return [scene for scene in scenes if not (cache_directory() / self._path(scene)).is_file()]
-
     def prepare(self, scenes: Sequence[str], say: Callable[[str], None] = SILENT.say) -> Iterable[str]:
         """Render scenes that are not in the cache, and yield the name of each that is ready.
 
-        Where it takes longer than a few seconds, all processors take part.
-
-        Raises:
-            ChildProcessError: processes that render were killed twice.
-
+        All processors take part if it takes longer than a few seconds.
         """
-        missing = self.unprepared(scenes)
+        missing = [scene for scene in scenes if not (cache_directory() / self._path(scene)).is_file()]
         yield from (scene for scene in scenes if scene not in missing)
         begun = time.perf_counter()
         for number, scene in enumerate(missing, start=1):
@@ -77,24 +63,22 @@ class Procedural(SceneSource):
             rest = missing[number:]
             if len(rest) * (time.perf_counter() - begun) / number > _WORTH_WORKERS:
                 with Pool(os.cpu_count() or 1, say=say) as pool:
-                    yield from (ready for ready, _ in pool.results(self._render, rest))
+                    yield from (ready for ready, _ in pool.results(self._store, rest))
                 return
 
-    def _render(self, scene: str) -> None:
-        """Render a scene into the cache unless it is there."""
-        load_or_render(self._path(scene), lambda: render_random_scene(self._seed, int(scene), self._size))
+    def _store(self, scene: str) -> None:
+        self._render(scene)
+
+    def _render(self, scene: str) -> Rendering:
+        """Return a scene from the cache, into which it is rendered unless it is there."""
+        return load_or_render(self._path(scene), lambda: render_random_scene(self._seed, int(scene), self._size))
 
     def _path(self, scene: str) -> Path:
         return Path(f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}", f"{scene}.npz")
 
 
 class SimGeo(SceneSource):
-    """The SimGeo scenes.
-
-    Args:
-        root: directory that may hold ``lucy``; without it the statue is used.
-
-    """
+    """The SimGeo scenes; without a directory ``lucy`` in ``root`` the statue is used."""
 
     name = "simgeo"
     evaluation = True

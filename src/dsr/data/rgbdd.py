@@ -29,7 +29,6 @@ from typing import Literal
 
 from dsr.data.frame_files import (
     NO_CAMERA,
-    expect_choice,
     expect_size,
     find_beside,
     in_natural_order,
@@ -40,6 +39,7 @@ from dsr.data.frame_files import (
 from dsr.data.preparation import FrameSet
 from dsr.data.scene_source import SceneSelection
 from dsr.sample import Scene
+from dsr.utils.guards import expect_one_of
 
 Split = Literal["test", "train"]
 COUNTS = {"test": 405, "train": 2215}  # numbers of scenes
@@ -51,14 +51,11 @@ _DEPTH, _MEASURED = "{0}_HR_gt.png", "{0}_LR_fill_depth.png"
 
 
 def find_frames(root: Path, split: Split | None = None, measured: bool = False) -> dict[str, Files]:
-    """Return photos, true depth and, if ``measured``, the phone's depth, by their number "20200509112638", in order.
-
-    Images in ``RGB`` and ``Depth`` are test images.
-    """
+    """Return photos, true depth and, if ``measured``, the phone's depth, by their number "20200509112638", in order."""
     found: dict[str, Files] = {}
     for name, files in _find_owners_layout(root, split, measured=measured):
         found.setdefault(name, files)
-    if split in (None, "test"):
+    if split in (None, "test"):  # those in circulation
         others = (f"Depth/{_DEPTH}", f"DepthLR/{_MEASURED}")[: 2 if measured else 1]
         for _, name, files in find_beside(root, "RGB", _PHOTO, others):
             found.setdefault(name, files)
@@ -84,6 +81,9 @@ def _find_owners_layout(root: Path, split: Split | None, *, measured: bool) -> I
                 yield folder.name, tuple(folder / name for name in wanted)
 
 
+DETECTED = ((find_frames, load_pair, "rgbdd"),)
+
+
 class RGBDD(FrameSet):
     """Images of RGB-D-D at their own size; ``real`` ones have the phone's depth as the measured map."""
 
@@ -91,7 +91,7 @@ class RGBDD(FrameSet):
     soft_edges = True
 
     def __init__(self, root: str, real: bool, split: Split = "test", scenes: SceneSelection = None) -> None:
-        expect_choice("split", split, COUNTS)
+        expect_one_of("split", split, COUNTS)
         name, load = ("rgbdd_real", load_measured_frame) if real else ("rgbdd", load_pair)
         find = functools.partial(find_frames, split=split, measured=real)
         super().__init__(name, root, find, load, scenes, count=COUNTS[split])

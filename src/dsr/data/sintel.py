@@ -24,12 +24,12 @@ from typing import Literal
 import numpy as np
 from torch import Tensor
 
-from dsr.data.frame_files import expect_size, read_bytes, read_picture, to_camera, to_depth
+from dsr.data.frame_files import expect_size, read_picture, to_camera, to_depth
 from dsr.data.preparation import FrameSet, Preparation
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
-from dsr.utils.guards import natural_key
+from dsr.utils.guards import MOST_FILE, natural_key, read_limited
 
 # Numbers of frames of the training sequences, 1064 in all
 SEQUENCES = MappingProxyType({
@@ -45,10 +45,7 @@ _CAM_LENGTH = 4 + 8 * (9 + 12)
 
 
 def find_frames(root: Path, rendering: Literal["clean", "final"] = "final") -> dict[str, tuple[Path, Path, Path]]:
-    """Return colour, depth and camera files, the first three arguments of :func:`load_frame`, by name, in order.
-
-    A name is ``SEQUENCE/frame_NNNN``. ``root`` holds ``training``, or is it. A frame that lacks a file is left out.
-    """
+    """Return colour, depth and camera files by name ``SEQUENCE/frame_NNNN``; ``root`` holds ``training``, or is it."""
     base = root / "training" if (root / "training").is_dir() else root
     found = {}
     for depth in sorted((base / "depth").glob("*/frame_*.dpt"), key=natural_key):
@@ -62,7 +59,7 @@ def find_frames(root: Path, rendering: Literal["clean", "final"] = "final") -> d
 
 def read_depth(path: Path, farthest: float = FARTHEST) -> Tensor:
     """Return a ``.dpt`` file, (1, H, W) float64 in metres, NaN where it is beyond ``farthest`` metres."""
-    content = read_bytes(path, "a .dpt file")
+    content = read_limited(path, MOST_FILE)
     if len(content) < _DPT_HEADER.size or not content.startswith(_TAG):
         raise ValueError(f"{path}: expected a .dpt file (tag 202021.25), got {_opening(content)}")
     _, width, height = _DPT_HEADER.unpack_from(content)
@@ -75,7 +72,7 @@ def read_depth(path: Path, farthest: float = FARTHEST) -> Tensor:
 
 def read_camera(path: Path, size: tuple[int, int]) -> Camera:
     """Return the intrinsics of a ``.cam`` file for pictures of ``size`` = (height, width)."""
-    content = read_bytes(path, "a .cam file")
+    content = read_limited(path, MOST_FILE)
     if len(content) != _CAM_LENGTH or not content.startswith(_TAG):
         raise ValueError(f"{path}: expected a .cam file (tag 202021.25, {_CAM_LENGTH} bytes), got {_opening(content)}")
     return to_camera(path, np.frombuffer(content, "<f8", count=9, offset=4).reshape(3, 3), size)
@@ -106,6 +103,9 @@ def sintel_frames() -> tuple[str, ...]:
         numbers = [1] if index < _SEQUENCES_WITH_THREE else []
         frames += [f"{sequence}_frame_{number:04d}" for number in (*numbers, length // 3, 2 * length // 3)]
     return tuple(frames)
+
+
+DETECTED = ((find_frames, load_frame, "sintel"),)
 
 
 class Sintel(FrameSet):

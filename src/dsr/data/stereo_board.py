@@ -26,11 +26,13 @@ import cv2
 import numpy as np
 import torch
 
+from dsr.data.download.collections import CATALOGUE
 from dsr.data.frame_files import find_beside, in_natural_order, read_frame
 from dsr.data.preparation import FrameSet
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera, Lens
 from dsr.sample import Scene
+from dsr.utils.versions import file_hash
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ _PHOTO = re.compile(r"(\d+)\.(?:png|jpg)")
 
 
 def find_frames(root: Path) -> dict[str, tuple[Path, Path, str]]:
-    """Return photo, depth and name, the first arguments of :func:`load_frame`, by name "8", in order."""
+    """Return photo, depth and name by name "8", in order."""
     found = {}
     for _, name, (photo, depth) in find_beside(root, "color", _PHOTO, ("depth/{}.png",)):
         if name in BOARDS:
@@ -82,8 +84,8 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path, str]]:
 def load_frame(rgb_path: Path, depth_path: Path, board: str, dataset: str, name: str) -> Scene:
     """Return one frame, the camera's map measured at the photo's size and the board's plane as the truth.
 
-    Its regions are ``board``, deeper inside the outline than :data:`INSIDE` pixels, and of that ``border``, not deeper
-    than :data:`BORDER`: what is blurred across the outline shows there.
+    Regions are ``board``, deeper inside the outline than :data:`INSIDE` pixels, and of that ``border``, up to
+    :data:`BORDER`, which shows what is blurred across the outline.
     """
     rgb, measured = read_frame(rgb_path, depth_path, size=(CAMERA.height, CAMERA.width))
     inside = depth_inside(BOARDS[board])
@@ -109,6 +111,15 @@ def plane_depth(board: Board) -> np.ndarray:
     across, down = cv2.undistortPoints(pixels, matrix, np.array(LENS.coefficients))[:, 0].T
     depth[rows, columns] = board.distance / (np.stack([across, down, np.ones_like(down)], axis=1) @ board.normal)
     return depth
+
+
+def _find_pinned(root: Path) -> dict[str, tuple[Path, Path, str]]:
+    """Return the frames by their checksums: recordings of others have files of the same names."""
+    pinned = {item.sha256 for item in CATALOGUE["stereo_board"].items}
+    return {name: files for name, files in find_frames(root).items() if file_hash(files[0]) in pinned}
+
+
+DETECTED = ((_find_pinned, load_frame, "stereo_board"),)
 
 
 class StereoBoard(FrameSet):

@@ -68,10 +68,7 @@ def read_intrinsics(path: Path, size: tuple[int, int]) -> Camera:
 def load_frame(
     folder: Path, dataset: str, name: str, *, refined: bool = False, intrinsics: Intrinsics | None = None
 ) -> Scene:
-    """Return the scene of a folder, with the sensor's depth or the authors' ``refined`` one.
-
-    ``intrinsics`` are for a folder without ``intrinsics.txt``.
-    """
+    """Return the scene of a folder; ``intrinsics`` are for one without ``intrinsics.txt``."""
     rgb_path, depth_path, *matrix = frame_files(folder, refined=refined)
     given = matrix[0] if matrix else intrinsics
     if given is None:
@@ -121,6 +118,9 @@ FRAMES = MappingProxyType(
         "xtion_3": "xtion/sun3ddata/brown_bm_2/brown_bm_2",
     }
 )
+
+
+DETECTED = ((find_frames, load_frame, "sunrgbd"),)
 
 
 class SunRGBD(FrameSet):

@@ -30,11 +30,7 @@ _COLOUR = re.compile(r"(\d{1,9})_left\.png")
 
 
 def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
-    """Return colour and depth files, the first two arguments of :func:`load_frame`, by name, in order.
-
-    A name is the frame's folder below ``root``, without ``image_left``, and its number as the files have it, such as
-    ``office/Easy/P000/000000``. A frame that lacks one of its two files is left out.
-    """
+    """Return colour and depth files by name "office/Easy/P000/000000", without ``image_left``."""
     found = {}
     for folder, below, files in walk(root):
         below[:] = [name for name in below if name != "depth_left"]
@@ -62,6 +58,9 @@ def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str, *, far
     rgb = read_picture(rgb_path)
     expect_size(rgb_path, rgb, _SIZE)
     return Scene(dataset, name, rgb, CAMERA, read_depth(depth_path, farthest))
+
+
+DETECTED = ((find_frames, load_frame, "tartanair"),)
 
 
 class TartanAir(FrameSet):

@@ -71,11 +71,10 @@ def load_frame(
     variables: Mapping[str, str] | None = None,
     factors: Sequence[int] = FACTORS,
 ) -> Scene:
-    """Return one scene, with the samples as measured low-resolution maps; of pictures the true depth is not known.
+    """Return one scene, with the samples as measured low-resolution maps.
 
-    ``path`` is a ``.mat`` file, whose ``variables`` are found where they are not named, or the intensity picture beside
-    ``samples_path``, which needs ``depth_range``, metres of levels 1 and 255. ``intrinsics`` are needed, as the files
-    hold none.
+    ``path`` is a ``.mat`` file, whose ``variables`` are found if they are not named, or the intensity picture beside
+    ``samples_path``, which needs ``depth_range``, metres of levels 1 and 255, and has no true depth.
     """
     if intrinsics is None:
         raise ValueError(
@@ -106,10 +105,7 @@ def read_samples(path: Path) -> tuple[Tensor, Tensor]:
 def read_matrices(
     path: Path, variables: Mapping[str, str] | None = None
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
-    """Return the picture, (3, H, W) float32 in [0, 1], and depth and samples, (1, H, W) float64 in metres, of a file.
-
-    None stands for what there is not. ``variables`` names variables, a field of a structure as "structure.field".
-    """
+    """Return the picture, (3, H, W) float32 in [0, 1], and depth and samples, (1, H, W) float64 in metres, or None."""
     found = read_variables(path)
     chosen = dict(variables or {})
     for role, name in chosen.items():
@@ -207,6 +203,9 @@ def _listed(found: Mapping[str, np.ndarray]) -> str:
 
 SCENES = ("books", "devil", "shark")
 ESTIMATED = (549.2, 549.2, 375.2, 334.3)  # fx, fy, cx, cy in pixels of the 610 x 810 photos
+
+
+DETECTED = ((find_frames, load_frame, "tofmark"),)
 
 
 class ToFMark(FrameSet):

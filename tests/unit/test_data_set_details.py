@@ -1,0 +1,320 @@
+"""What single data sets have of their own: confidence, sky, rays, levels and layouts; and their real frames."""
+
+import struct
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from data_set_files import LEVELS, VGA, dpt, npy, opened, ramp, rays, turned, write_frame
+from PIL import Image
+from refusals import refused
+from small_files import encoded_png as png
+from small_files import png_by_its_specification, written
+
+from dsr.data import arkitscenes, icl, sintel, sunrgbd, tartanair
+from dsr.data.eight_bit import NOTE, EightBit
+from dsr.degradation.downsampling import Downsampling, make_sample
+from dsr.geometry.camera import to_range
+
+
+def touch(root, *names):
+    for name in names:
+        written(root / name, b"")
+
+
+def test_uncertain_pixels_of_the_lidar_become_holes(tmp_path, capfd):
+    kind = write_frame("arkitscenes", tmp_path)
+    confidence = (np.arange(256) % 3 * np.ones((192, 1))).astype(np.uint8)
+    path = tmp_path / f"Validation/41069021/confidence/{kind.name}.png"
+    measured = path.parents[1] / f"lowres_depth/{kind.name}.png"
+    lacking = opened(kind, tmp_path, min_confidence=1)
+    assert "confidence in the folder confidence" in refused(lambda: lacking.load(kind.name), measured, capfd)
+    written(path, png(confidence))
+    for least in (1, 2):
+        known = opened(kind, tmp_path, min_confidence=least).load(kind.name).measured[7.5][0].isfinite()
+        np.testing.assert_array_equal(known, confidence >= least)
+    for content, message in (
+        (png(ramp(192, 256, 1)), "expected one channel of 8 bits"), (png(confidence[1:]), "expected 192 x 256 pixels"),
+        (png(confidence + 1), "expected confidence from 0 to 2, got 3"),
+        (png(confidence * 0), "expected a pixel of confidence 1, there is none"),
+    ):  # fmt: skip
+        path.write_bytes(content)
+        assert message in refused(lambda: opened(kind, tmp_path, min_confidence=1).load(kind.name), path, capfd)
+    with pytest.raises(ValueError, match="min_confidence: expected 0, 1 or 2, got 3"):
+        opened(kind, tmp_path, min_confidence=3)
+
+
+def test_intrinsics_of_the_tablet_may_be_a_millisecond_off_or_missing(tmp_path, capfd):
+    kind = write_frame("arkitscenes", tmp_path)
+    [path] = tmp_path.rglob("*.pincam")
+    path = path.rename(path.with_name("41069021_305.245.pincam"))
+    scene = opened(kind, tmp_path).load(kind.name)
+    assert (scene.camera.fx, scene.notes) == (1590.25, ())
+    for text in (b"256 192 212 212 127 96", b"1920 1440 0 1590 960 720"):
+        path.write_bytes(text)
+        assert "expected" in refused(lambda: opened(kind, tmp_path).load(kind.name), path, capfd)
+    path.rename(path.with_name("41069021_305.246.pincam"))
+    scene = opened(kind, tmp_path).load(kind.name)
+    assert (scene.camera.fx, scene.notes) == (pytest.approx(960 * np.sqrt(3)), (arkitscenes.NOTE,))
+
+
+def test_frames_of_the_tablet_are_found_in_both_splits_and_spellings(tmp_path):
+    for place, photos in (("Validation/1", "wide"), ("Validation/3", "color"), ("Training/2", "wide")):
+        name = f"{place[-1]}_1.500.png"
+        touch(tmp_path / place, f"{photos}/{name}", f"highres_depth/{name}", f"lowres_depth/{name}")
+    assert list(arkitscenes.find_frames(tmp_path, "validation")) == ["1_1.500", "3_1.500"]
+    assert list(arkitscenes.find_frames(tmp_path, "training")) == ["2_1.500"]
+    assert list(arkitscenes.find_frames(tmp_path / "Training", "training")) == ["2_1.500"]
+    assert len(arkitscenes.find_frames(tmp_path)) == 3
+    assert not arkitscenes.ARKitScenes(str(tmp_path), "training").evaluation
+
+
+SKY = VGA / 1024
+SKY[0, :3] = 0, 1e10, 10000
+
+
+@pytest.mark.parametrize("name", ["tartanair", "sintel"])
+def test_what_is_farther_than_the_sky_is_a_hole(tmp_path, name):
+    kind = write_frame(name, tmp_path, npy=npy(SKY.astype(np.float32)), dpt=dpt(SKY))
+    for farthest in (1000.0, 1.5):
+        depth = opened(kind, tmp_path, farthest=farthest).load(kind.name).depth[0]
+        np.testing.assert_array_equal(depth, np.where((SKY > 0) & (farthest >= SKY), SKY, np.nan))
+
+
+def test_frames_of_both_layouts_of_tartanair_are_listed_by_folder_and_number(tmp_path):
+    for name in ("sea/Easy/P001/image_left/000001_left.png", "sea/Easy/P001/depth_left/000001_left_depth.npy",
+                 "sea/Easy/P001/image_left/000000_left.png", "sea/Easy/P001/depth_left/000000_left_depth.npy",
+                 "sea/Easy/P001/image_left/000002_left.png", "sea/Easy/P001/image_right/000000_right.png",
+                 "flat/000007_left.png", "flat/000007_left_depth.npy"):  # fmt: skip
+        touch(tmp_path, name)
+    found = tartanair.find_frames(tmp_path)
+    assert list(found) == ["flat/000007", "sea/Easy/P001/000000", "sea/Easy/P001/000001"]
+    place = tmp_path / "sea/Easy/P001"
+    expected = (place / "image_left/000001_left.png", place / "depth_left/000001_left_depth.npy")
+    assert found["sea/Easy/P001/000001"] == expected
+    assert list(tartanair.find_frames(tmp_path / "flat")) == ["000007"]
+    assert list(tartanair.find_frames(place)) == ["000000", "000001"]
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (dpt(SKY) + b"\0", "got 1228801 bytes"), (b"P5 6" + dpt(SKY)[4:], "b'P5 6'"), (dpt(-SKY), "got -1e+10"),
+        (struct.pack("<fii", 202021.25, 2**31 - 1, 2**31 - 1) + bytes(8), "2147483647 x 2147483647"),
+        (struct.pack("<fii", 202021.25, -2, -3) + bytes(24), "-3 x -2"), (dpt(SKY * np.nan), "got NaN"),
+        (dpt(SKY[1:]), "480 x 640"), (dpt(0 * SKY + 1e10), "within 1000 m"),
+    ],
+)  # fmt: skip
+def test_depth_of_sintel_that_cannot_be_is_refused(tmp_path, capfd, content, reason):
+    kind = write_frame("sintel", tmp_path, dpt=content)
+    path = tmp_path / list(kind.files)[-1]
+    assert reason in refused(lambda: opened(kind, tmp_path).load(kind.name), path, capfd)
+
+
+def test_frames_of_sintel_are_listed_from_the_root_or_its_training_folder(tmp_path):
+    for name in ("alley_1/frame_0001", "market_2/frame_0010"):
+        touch(tmp_path / "training", f"final/{name}.png", f"depth/{name}.dpt", f"camdata_left/{name}.cam")
+    touch(tmp_path, "training/depth/market_2/frame_0011.dpt")
+    for root in (tmp_path, tmp_path / "training"):
+        assert list(sintel.find_frames(root)) == ["alley_1/frame_0001", "market_2/frame_0010"]
+    assert sintel.find_frames(tmp_path, "clean") == {}
+    assert (len(sintel.SEQUENCES), sum(sintel.SEQUENCES.values())) == (23, 1064)
+
+
+def test_ray_of_icl_of_length_0_or_beyond_the_rooms_is_a_hole(tmp_path):
+    distances = VGA.astype(float)
+    distances[0, :3] = 0, 10001, np.inf
+    kind = write_frame("icl as rendered", tmp_path, depth=rays(distances))
+    assert opened(kind, tmp_path).load(kind.name).depth.isnan().nonzero().tolist() == [[0, 0, 0], [0, 0, 1], [0, 0, 2]]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda whole: whole.rpartition(b" ")[0].rpartition(b" ")[0], lambda whole: whole + b"1.0",
+        lambda whole: whole + b"1.0 " * 5_000_000, lambda whole: b"-1" + whole, lambda whole: b"nan" + whole[1:],
+        lambda whole: b"1_0" + whole[1:], lambda whole: b"<html>" + whole[1:], lambda whole: bytes(1000),
+        lambda whole: b"1e30 " * 307200,
+    ],
+)  # fmt: skip
+def test_damaged_text_of_distances_is_refused_in_one_line(tmp_path, capfd, damage):
+    kind = write_frame("icl as rendered", tmp_path)
+    [path] = tmp_path.rglob("*.depth")
+    path.write_bytes(damage(path.read_bytes()))
+    assert "expected " in refused(lambda: opened(kind, tmp_path).load(kind.name), path, capfd)
+
+
+def test_16_bit_picture_of_icl_keeps_its_values(tmp_path):
+    colours = np.zeros((480, 640, 3))
+    colours[5, 6] = 65535, 257, 1
+    kind = write_frame("icl as rendered", tmp_path, png=png_by_its_specification(colours, colour=2))
+    rgb = opened(kind, tmp_path).load(kind.name).rgb
+    torch.testing.assert_close(rgb[:, 5, 6], torch.tensor([1, 257 / 65535, 1 / 65535]))
+
+
+def test_frames_of_all_three_layouts_of_icl_are_listed_by_folder_and_number(tmp_path, monkeypatch):
+    for name in ("b/rgb/0.png", "b/depth/0.png", "b/rgb/10.png", "b/depth/10.png", "b/rgb/2.png", "b/depth/2.png",
+                 "b/rgb/3.png", "b/associations.txt", "a/scene_00_0001.png", "a/scene_00_0001.depth",
+                 "a/scene_00_0002.depth", "c/d/rgb.png", "c/d/depth.png", ".trash/rgb.png", ".trash/depth.png",
+                 "b/rgb/thumbnail.png", "b/depth/thumbnail.png"):  # fmt: skip
+        touch(tmp_path / "icl", name)
+    monkeypatch.chdir(tmp_path)
+    for root in (tmp_path / "icl", (tmp_path / "icl").relative_to(tmp_path)):
+        found = icl.find_frames(root)
+        assert list(found) == ["a/0001", "b/0000", "b/0002", "b/0010", "c/d"]
+        assert found["b/0010"] == (root / "b/rgb/10.png", root / "b/depth/10.png")
+        assert found["a/0001"] == (root / "a/scene_00_0001.png", root / "a/scene_00_0001.depth")
+    assert list(icl.find_frames(tmp_path / "icl/c/d")) == ["d"]
+
+
+def test_office_ceiling_is_flat_in_orthogonal_depth(shared):
+    frames = icl.find_frames(shared / "real/icl_nuim")
+    assert list(frames) == ["living", "office/0000"]
+    scene = icl.load_frame(*frames["office/0000"], "icl_nuim", "office/0000")
+    orthogonal = scene.depth[0, :120, :560]
+    along = orthogonal * scene.camera.ray_lengths()[:120, :560]
+
+    def bend(depth):
+        """Return how far the depth lies from a plane, 1/z = a u + b v + c, in metres (root mean square)."""
+        known = torch.ones_like(depth).nonzero().double()
+        system = torch.column_stack((known, torch.ones(len(known))))
+        plane = torch.linalg.lstsq(system, depth.reciprocal().reshape(-1, 1)).solution
+        return ((system @ plane).reciprocal()[:, 0] - depth.reshape(-1)).square().mean().sqrt().item()
+
+    assert bend(orthogonal) < 0.01
+    assert bend(along) > 5 * bend(orthogonal)
+
+
+@pytest.mark.parametrize(("dataset", "near", "far"), [("lu", 0.7955, 3.5), ("middlebury8", 1.3152, 2.992)])
+def test_disparity_and_unit_of_8_bit_benchmarks_are_the_level(tmp_path, dataset, near, far):
+    levels = LEVELS.copy()
+    levels[3, :2] = 0, 255
+    name = {"lu": "RGBD_01", "middlebury8": "Middlebury_01"}[dataset]
+    write_frame("lu", tmp_path, depth_png=png(levels))
+    for path in list(tmp_path.rglob("*.png")):
+        path.rename(path.with_name(path.name.replace("RGBD_01", name)))
+    scene = EightBit(str(tmp_path), dataset, "found").load(name)
+    assert (scene.dataset, scene.name, scene.unit.name, scene.unit.limits) == (dataset, name, "levels", (0, 255))
+    for found in (to_range(scene.depth, scene.camera, "disparity"), scene.unit.convert(scene.depth)):
+        np.testing.assert_allclose(found[0], levels, rtol=0, atol=1e-10)
+    assert (scene.depth.min().item(), scene.depth.max().item()) == pytest.approx((near, far), abs=1e-4)
+
+
+@pytest.mark.parametrize(("scale", "expected"), [(4, 2.4185), (8, 4.5383)])
+def test_bicubic_row_of_the_field_comes_out_on_lu(shared, scale, expected):
+    data = EightBit(str(shared / "modern/Lu"), "lu")
+    errors = []
+    for name in data.scenes():
+        sample = make_sample(data.load(name), scale, Downsampling("bicubic"), "disparity")
+        width, height = sample.camera.width, sample.camera.height
+        levels_lr = Image.fromarray(sample.disparity_lr()[0].float().numpy())
+        levels = np.asarray(levels_lr.resize((width, height), Image.Resampling.BICUBIC)).clip(0, 255)
+        errors.append(np.sqrt(np.mean((levels - sample.unit.convert(sample.depth)[0].numpy()) ** 2)))
+    assert np.mean(errors) == pytest.approx(expected, abs=1e-3)
+
+
+def test_thirty_pairs_of_middlebury_are_read(shared):
+    data = EightBit(str(shared / "modern"), "middlebury8")
+    assert len(data.scenes()) == 30
+    scene = data.load("Middlebury_30")
+    assert scene.notes == (NOTE,)
+    assert tuple(scene.depth.shape) == (1, 381, 432)
+    assert (scene.unit.convert(scene.depth).min().item(), scene.unit.convert(scene.depth).max().item()) == (
+        pytest.approx(24),
+        pytest.approx(134),
+    )
+
+
+def test_real_frames_of_rendered_sets_are_read(shared):
+    [files] = tartanair.find_frames(shared / "real/tartanair").values()
+    depth = tartanair.load_frame(*files, "tartanair", "000000").depth
+    assert not depth.isnan().any()
+    assert depth.median().item() == pytest.approx(1.838, abs=0.001)
+    folder = shared / "real/icl_nuim/living"
+    depth = icl.load_frame(folder / "rgb.png", folder / "depth.png", "icl_nuim", "living").depth
+    assert (depth.min().item(), depth.max().item()) == (1.641, 3.43)
+
+
+def test_depth_of_sun_rgbd_is_the_sensors_or_the_refined_one_of_one_picture_each(tmp_path, capfd):
+    kind = write_frame("sunrgbd", tmp_path)
+    refined = written(tmp_path / "kv2/x/depth_bfx/2.png", png(turned(ramp(384, 512, 8181))))
+    assert opened(kind, tmp_path, refined=True).load(kind.name).depth[0, 10, 20].item() == 8.221
+    refined.with_name("3.png").write_bytes(b"")
+    data = opened(kind, tmp_path, refined=True)
+    assert "got 2" in refused(lambda: data.load(kind.name), refined.parent, capfd)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "350 0 255 0 355 190 0 0", "350 0 255 0 355 190 0 0 1 0", "fx = 3", "1" * 5000, "nan 0 255 0 355 190 0 0 1",
+        "-3 0 255 0 355 190 0 0 1", "350 0 999 0 355 190 0 0 1", "350 0 255 0 355 -9 0 0 1",
+        "350 2 255 0 355 190 0 0 1", "350 0 255 0 355 0 1 1 1", "1e300 0 255 0 1e300 190 0 0 1",
+    ],
+)  # fmt: skip
+def test_invalid_intrinsics_are_refused(tmp_path, capfd, text):
+    kind = write_frame("sunrgbd", tmp_path, txt=text.encode())
+    path = tmp_path / "kv2/x/intrinsics.txt"
+    assert "expected " in refused(lambda: opened(kind, tmp_path).load(kind.name), path, capfd)
+
+
+def test_folder_of_sun_rgbd_without_intrinsics_needs_given_ones(tmp_path, capfd):
+    kind = write_frame("sunrgbd", tmp_path)
+    (tmp_path / "kv2/x/intrinsics.txt").unlink()
+    message = refused(lambda: opened(kind, tmp_path).load(kind.name), tmp_path / "kv2/x", capfd)
+    assert "intrinsics=(fx, fy, cx, cy)" in message
+    assert opened(kind, tmp_path, intrinsics=(300, 301, 1, 2)).load(kind.name).camera.cy == 2
+    data = opened(kind, tmp_path, intrinsics=(300, 301, 1, 2000))
+    assert "expected " in refused(lambda: data.load(kind.name), "intrinsics", capfd)
+
+
+def test_scenes_of_sun_rgbd_are_found_at_any_depth_by_their_path(tmp_path):
+    names = ["kv1/NYUdata/NYU0002", "kv1/NYUdata/NYU0001", "xtion/sun3ddata/a/b/c", "realsense/lg/x"]
+    for name in names:
+        depth = "depth_bfx" if "lg" in name else "depth"
+        touch(tmp_path / name, "image/1.jpg", f"{depth}/1.png", "inner/image/1.jpg", "inner/depth/1.png")
+    touch(tmp_path, "SUNRGBDtoolbox/image/1.jpg")
+    assert list(sunrgbd.find_frames(tmp_path)) == sorted(names)
+    assert sunrgbd.find_frames(tmp_path)["realsense/lg/x"] == (tmp_path / "realsense/lg/x",)
+    assert list(sunrgbd.find_frames(tmp_path / names[0])) == ["NYU0002"]
+
+
+def test_real_scenes_are_read_and_the_refined_depth_agrees_where_both_are_known(shared):
+    frames = sunrgbd.find_frames(shared / "real/sunrgbd")
+    assert list(frames) == ["2014-12-18_11-31-54_260595134347", "img_0063"]
+    for name, arguments in frames.items():
+        raw = sunrgbd.load_frame(*arguments, "sunrgbd", name)
+        refined = sunrgbd.load_frame(*arguments, "sunrgbd", name, refined=True)
+        assert 0.1 < raw.depth.isnan().double().mean() < 0.4
+        assert not refined.depth.isnan().any()
+        assert (raw.depth - refined.depth).abs().nanmedian() < 0.01
+
+
+def test_nyu_crop_starts_at_column_40_and_row_44_as_its_intrinsics_say(shared):
+    folder = shared / "real/sunrgbd/img_0063"
+    full, cut = (cv2.imread(str(folder / part / "img_0063.jpg")) for part in ("fullres", "image"))
+    _, _, best, _ = cv2.minMaxLoc(cv2.matchTemplate(full, cut, cv2.TM_SQDIFF))
+    assert best == (40, 44)
+    whole = sunrgbd.read_intrinsics(folder / "fullres/intrinsics.txt", full.shape[:2])
+    camera = sunrgbd.load_frame(folder, "sunrgbd", "a").camera
+    counted_from_0 = whole.cx - 1, whole.cy - 1
+    assert (counted_from_0[0] - best[0], counted_from_0[1] - best[1]) == pytest.approx((camera.cx, camera.cy))
+
+
+def test_pair_of_loose_files_is_read_with_intrinsics(shared):
+    folder = shared / "real/sunrgbd/open3d_sample"
+    scene = sunrgbd.load_pair(
+        folder / "SUN_color.jpg", folder / "SUN_depth.png", "sunrgbd", "sample", (570, 570, 320, 240)
+    )
+    assert scene.depth.nan_to_num(0).max().item() == 9.870  # beyond 8 m, not cut
+
+
+def test_scenes_behind_links_are_found_and_circular_links_are_harmless(tmp_path):
+    for part in ("image", "depth"):
+        (tmp_path / "elsewhere" / "one" / part).mkdir(parents=True)
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "linked").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / "back").symlink_to(root)
+    assert list(sunrgbd.find_frames(root)) == ["linked/one"]
