@@ -107,17 +107,3 @@ def test_mesh_and_cloud_beyond_limits_are_said_and_recorded(capture, tmp_path, c
         f"the mesh has fewer triangles than the depth map gives (--max-faces) ({len(faces)} of 5922, by quadric" in said
     )
     assert "the cloud has fewer points than the depth map gives (--max-points)" in said
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (("--with", "nosuch"), "--only, --with, --without: expected some of depth, renderings, "),
-        (("--max-faces", "99"), "--max-faces: expected at least 100, got 99"),
-        (("--max-points", "0"), "--max-points: expected at least 100, got 0"),
-    ],
-)
-def test_refusals_write_nothing(arguments, text, capture, tmp_path, capsys):
-    assert upsample(capture, *arguments, "-o", tmp_path / "out") == 2
-    assert text in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()

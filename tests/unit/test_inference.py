@@ -3,7 +3,6 @@
 import math
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from methods_at_hand import AT_HAND
@@ -180,20 +179,6 @@ def test_invalid_picture_is_refused() -> None:
         upsample_depth(_photo(48, 64), depth.int(), camera)
     with pytest.raises(ValueError, match="device: expected auto, cpu or a device of this machine, got 'gpu'"):
         upsample_depth(_photo(48, 64), depth, camera, device="gpu")
-
-
-def test_arrays_and_tensors_give_the_same_result() -> None:
-    camera, depth = _camera(48, 64), _plane(12, 16, _camera(48, 64)).float()
-    depth[0, 5, 5] = 1.0
-    bytes_ = (255 * _photo(48, 64)).round().to(torch.uint8)
-    of_tensors = dsr.upsample(bytes_, depth, camera)
-    known = depth[0].numpy() < 100
-    of_arrays = dsr.upsample(bytes_.permute(1, 2, 0).numpy(), depth[0].numpy(), camera, scale=4, mask=known)
-    assert isinstance(of_arrays, np.ndarray)
-    assert of_arrays.dtype == np.float32
-    np.testing.assert_allclose(of_arrays, of_tensors[0].numpy(), rtol=2e-6)  # the photo's layout in memory differs
-    floats = dsr.upsample(bytes_.permute(1, 2, 0).numpy() / 255, depth[0].numpy(), camera)
-    np.testing.assert_allclose(floats, of_arrays, rtol=1e-4)
 
 
 def test_result_without_any_depth_is_refused_rather_than_filled(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,6 @@ one object each, such as ``{"note": ..., "warning": ...}``. It ends with the pro
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import os
 import sys
@@ -19,9 +18,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn, TextIO
 
-from rich.console import Console
-
-from dsr.app.upsample.reporting import Reporter
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.notes import Assumption
 from dsr.utils.console import one_line, printable, shorten
@@ -61,16 +57,10 @@ def send(**facts: Any) -> None:
     _OUTPUT[-1].flush()
 
 
-class _Sender(Reporter):
-    """Sends notes to the server; what else is said is about the command's files."""
-
-    def __init__(self) -> None:
-        super().__init__(Console(file=io.StringIO()))
-
-    def facts(self, facts: Sequence[Assumption]) -> None:
-        """Send notes."""
-        for fact in facts:
-            send(note=shorten(printable(fact.message), _LONGEST_NOTE), warning=bool(fact.code))
+def _tell(message: str | Sequence[Assumption]) -> None:
+    """Send notes; what else is said is about the command's files."""
+    for fact in () if isinstance(message, str) else message:
+        send(note=shorten(printable(fact.message), _LONGEST_NOTE), warning=bool(fact.code))
 
 
 class _Steps(Progress):
@@ -172,7 +162,7 @@ def _thumb_of(pair: Pair) -> str:
 
 def _send_found(frames: Frames) -> None:
     """Send the notes that concern all frames together."""
-    _Sender().facts(frames.found.assumptions)
+    _tell(frames.found.assumptions)
     if frames.found.unpaired:
         send(note=f"files without a partner, left out: {len(frames.found.unpaired)}", warning=False)
 
@@ -180,13 +170,13 @@ def _send_found(frames: Frames) -> None:
 def _upsample(request: UpsampleRequest) -> Path:
     """Upsample the frame, and return the folder of its result."""
     from dsr.app.upsample.frames import find_frames  # noqa: PLC0415
-    from dsr.app.upsample.workers import work_through  # noqa: PLC0415
+    from dsr.app.upsample.run import work_through  # noqa: PLC0415
 
     frames = find_frames(request)
     _send_found(frames)
     if len(frames.found.pairs) != 1:
         raise ValueError(f"expected one frame, got {len(frames.found.pairs)}")
-    (done,) = work_through(request, frames, _Sender(), _Steps())
+    (done,) = work_through(request, frames, _tell, _Steps())
     if done.problem is not None:
         raise ValueError(done.problem)
     return done.target
@@ -194,14 +184,13 @@ def _upsample(request: UpsampleRequest) -> Path:
 
 def _result(request: UpsampleRequest, folder: Path) -> None:
     """Upsample the frame, and write what the page shows of it."""
-    from dsr.app.upsample.outputs import INFO  # noqa: PLC0415
-    from dsr.app.upsample.stored import read_info, read_result  # noqa: PLC0415
+    from dsr.app.upsample.stored import read_complete, read_result  # noqa: PLC0415
     from dsr.report.surface_page import content_of, data_of, pack_result  # noqa: PLC0415
 
     target = _upsample(request)
     send(stage="preparing the surfaces")
     viewed = read_result(target, "result")
-    facts = {**(viewed.facts or {}), **_facts(viewed.camera, read_info(target / INFO))}
+    facts = {**(viewed.facts or {}), **_facts(viewed.camera, read_complete(target))}
     packed = pack_result(replace(viewed, facts=facts), _VERTICES, _PHOTO)
     shown = {"content": content_of([packed], "dsr app"), "data": data_of([packed])}
     (folder / SHOWN).write_text(json.dumps(shown), encoding="utf-8")
