@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import json
 import math
@@ -181,12 +180,15 @@ class ResultFolder:
         """Return the stored result if it is reusable; None if a file of it, that of the errors if needed, is lost."""
         if not self.reusable:
             return None
-        with contextlib.suppress(OSError, ValueError):
+        try:
             depth = torch.from_numpy(read_depth(self.path, camera))[None]
-            with contextlib.nullcontext() if errors else contextlib.suppress(OSError, ValueError):
-                return Surface(depth, *(torch.from_numpy(each)[None] for each in read_errors(self.path, camera)))
-            return Surface(depth)
-        return None
+        except (OSError, ValueError):
+            return None
+        try:
+            depth_error, angle_error = read_errors(self.path, camera)
+        except (OSError, ValueError):
+            return None if errors else Surface(depth)
+        return Surface(depth, torch.from_numpy(depth_error)[None], torch.from_numpy(angle_error)[None])
 
     def store(self, result: Result, seconds: Mapping[str, float], *, reused: bool = False) -> Stored:
         """Write the parts of a result and ``info.json``, which says that it is not complete until the end.
