@@ -47,13 +47,7 @@ class Done(NamedTuple):
 
 
 class FrameWork:
-    """Upsamples the pictures of a request, one at a time.
-
-    Args:
-        request: the request.
-        frames: all of its pictures, also those of other shards, which determine units and neighbours.
-
-    """
+    """Upsamples the pictures of a request, one at a time; those of other shards are neighbours and determine units."""
 
     def __init__(self, request: UpsampleRequest, frames: Frames) -> None:
         self._request, self._frames = request, frames

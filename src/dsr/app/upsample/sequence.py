@@ -19,21 +19,9 @@ from dsr.notes import LIMITS, Assumption
 
 
 class FrameSequence:
-    """The frames of a folder in order, with their poses.
+    """The frames of each folder of depth maps in order, with the poses of a file, or those that the frames have.
 
-    Args:
-        pairs: the frames.
-        read: reads one of them.
-        neighbours: number of frames that vote on each frame's depth beside itself.
-        poses: file of poses; None for those that the frames themselves have.
-
-    Attributes:
-        recordings: the frames of each folder of depth maps.
-        given: whether the poses are those of a file.
-
-    Raises:
-        ValueError: the file is damaged, or does not fit the frames.
-
+    A number of neighbours votes on each frame's depth. A file that is damaged, or does not fit, is a ValueError.
     """
 
     def __init__(
@@ -66,12 +54,7 @@ class FrameSequence:
         return [folder[number] for number in found]
 
     def with_pose(self, pair: Pair, picture: Picture) -> Picture:
-        """Return a frame with its pose from the file, if there is one.
-
-        Raises:
-            ValueError: neighbours are to vote, and the frame has no pose.
-
-        """
+        """Return a frame with its pose from the file, if any; a ValueError if neighbours vote and it has no pose."""
         notes = list(self._matched)
         if self._poses is not None:
             picture = replace(picture, pose=self._poses.get(pair.name), up="")
