@@ -46,6 +46,7 @@ def write_result(folder, depth=None, *, camera=CAMERA, with_input=True, with_err
         np.savez(folder / "confidence.npz", **{name: each.astype(np.float32) for name, each in errors.items()})
     entries = {
         "complete": True,
+        "inputs": {},
         "settings": {"max_error": max_error},
         "files": ["depth_metres.tiff"],
         "method": "facets",

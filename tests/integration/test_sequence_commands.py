@@ -309,13 +309,6 @@ def test_poses_that_are_read_wrongly_are_reported_once_and_in_every_info(walked,
         assert warning["value"] > warning["threshold"]
 
 
-def test_strict_refuses_wrong_poses_and_writes_no_result(walked, capsys):
-    out = walked.parent / "out"
-    assert upsample(walked, *poses_of(walked, np.linalg.inv), *DEPTH_ONLY, "--strict", "-o", out) == 2
-    assert "the poses are probably from world to camera" in capsys.readouterr().err
-    assert not list(out.rglob("info.json"))
-
-
 def test_frames_without_a_pose_are_reported_and_strict_refuses_them(walked, capsys):
     def write(*numbers):
         rows = [(*each[:3, 3], *Rotation.from_matrix(each[:3, :3]).as_quat()) for each in walk(6)]

@@ -7,8 +7,7 @@ from captures import FRAMES, INTRINSICS, SIZE_LR
 from PIL import Image
 from upsampling import info, refused_line, upsample
 
-from dsr.io.depth_files import read_depth_file
-from dsr.io.inputs import read_picture
+from dsr.io.depth_files import read_depth_file, write_depth_file
 
 DEPTH_ONLY = ("--method", "bicubic", "--only", "depth")
 
@@ -119,17 +118,17 @@ def test_resumed_folder_of_millimetre_floats_keeps_its_unit(tmp_path, monkeypatc
         captures.save(folder / "rgb" / f"{number}.png", captures.photo(number))
         np.save(folder / "depth" / f"{number}.npy", np.full(SIZE_LR, far, np.float32))
 
-    def read_first_only(pair, *arguments):
-        if pair.name != "0" and (out / "0" / "info.json").is_file():
+    def write_first_only(path, values):
+        if path.parent.name != "0":
             raise KeyboardInterrupt
-        return read_picture(pair, *arguments)
+        write_depth_file(path, values)
 
     assert upsample(folder, "-o", tmp_path / "whole", *DEPTH_ONLY) == 0
     out = tmp_path / "resumed"
     with monkeypatch.context() as patch:
-        patch.setattr("dsr.app.upsample.frame.read_picture", read_first_only)
+        patch.setattr("dsr.app.upsample.outputs.write_depth_file", write_first_only)
         assert upsample(folder, "-o", out, *DEPTH_ONLY) == 130
-    assert [path.name for path in out.iterdir()] == ["0"]
+    assert [path.parent.name for path in out.rglob("depth*")] == ["0", "0"]
     assert upsample(folder, "-o", out, *DEPTH_ONLY) == 0
     for number, metres in enumerate((1.5, 0.15, 0.18)):
         for place in (tmp_path / "whole", out):

@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import pytest
-from commands import run_python
 from small_frames import FRAMES, results, write_frames
 from upsampling import upsample
 
@@ -54,31 +53,6 @@ def test_shard_alone_works_on_its_block_and_says_how_it_went(folder, tmp_path, c
     assert (summary["shard"], summary["outcomes"]) == ("2/3", {"done": 1})
     assert [each["frames"] for each in summary["failed"]] == [["003"]]
     assert "003.png" in summary["failed"][0]["problem"]
-
-
-BOTH = """
-import os
-import sys
-
-from dsr.cli import main
-
-running = []
-for shard in ("1/2", "2/2"):
-    process = os.fork()
-    if not process:
-        os._exit(main([*sys.argv[1:], "--shard", shard]))
-    running.append(process)
-print(*(os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) for process in running))
-"""
-
-
-def test_two_shards_at_once_give_one_folder(folder, tmp_path):
-    (tmp_path / "both.py").write_text(BOTH)
-    options = ["upsample", str(folder), "-o", str(tmp_path / "out"), *FAST]
-    ended = run_python(str(tmp_path / "both.py"), *options, cwd=tmp_path)
-    assert ended.stdout.splitlines()[-1] == "2 0"  # the first two maps are holes alone
-    assert upsample(folder, "-o", tmp_path / "whole", *FAST) == 2
-    assert results(tmp_path / "out") == results(tmp_path / "whole")
 
 
 def test_bad_shards_are_refused_in_one_line(folder, tmp_path, capsys):

@@ -1,7 +1,6 @@
 """``dsr upsample --workers``: the same results from several processes, problems and all."""
 
 import json
-import re
 
 import numpy as np
 import pytest
@@ -71,16 +70,6 @@ def killing(tmp_path, monkeypatch):
         return main(["upsample", frames, "-o", str(tmp_path / "out"), *options, *method])
 
     return run
-
-
-def test_picture_of_a_killed_worker_is_done_by_another(killing, tmp_path, capsys):
-    assert killing(1) == 0
-    said = capsys.readouterr()
-    # a picture of the other worker that is finished but not yet reported is found complete
-    assert re.search(r"8 pictures: (8 done|7 done, 1 complete already) ", said.out)
-    assert len([line for line in said.out.splitlines() if "worker" in line]) == 1
-    assert said.err == ""
-    assert len(list((tmp_path / "out").glob("*/depth.png"))) == 8
 
 
 def test_pictures_of_workers_that_are_killed_twice_fail_and_the_same_command_goes_on(killing, tmp_path, capsys):

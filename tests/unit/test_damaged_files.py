@@ -28,8 +28,8 @@ from small_results import write_result
 
 from dsr.app.entry import run_command
 from dsr.app.training_runs import read_config, read_plain_yaml
-from dsr.app.upsample.outputs import kept_surface, read_previous_run
-from dsr.app.upsample.stored import _read_record, read_result
+from dsr.app.upsample.outputs import ResultFolder
+from dsr.app.upsample.stored import read_exports, read_info, read_result
 from dsr.data.download.fetching import Checksums, unpack
 from dsr.data.folder import Folder, load_scene
 from dsr.data.matlab import read_variables
@@ -356,13 +356,13 @@ def test_answers_with_a_time_that_is_none_are_left_out_and_the_others_count(tmp_
 ])  # fmt: skip
 def test_record_of_an_earlier_result_that_is_none_is_refused(tmp_path, text):
     (tmp_path / "info.json").write_text(text)
-    refusal(tmp_path / "info.json", read_previous_run, tmp_path)
+    refusal(tmp_path / "info.json", read_info, tmp_path)
 
 
 @pytest.mark.parametrize("text", ["[]", '{"exports": 5}', '{"exports": {"a": "b"}}', '{"exports": {"a": [5]}}'])
 def test_record_of_exports_that_is_none_is_refused(tmp_path, text):
     (tmp_path / "exports.json").write_text(text)
-    refusal(tmp_path / "exports.json", _read_record, tmp_path)
+    refusal(tmp_path / "exports.json", read_exports, tmp_path)
 
 
 @pytest.mark.parametrize("text", ["NaN", "-Infinity", "[1e999]", "9" * 5000, DEEP, "{", ""])
@@ -574,7 +574,8 @@ def test_damaged_depth_of_an_earlier_result_is_made_again_and_refused_where_it_i
     folder = write_result(tmp_path / "a")
     path = folder / "depth_metres.tiff"
     path.write_bytes(damage(path.read_bytes()))
-    assert kept_surface(folder, Camera(64, 64, 80.0, 80.0, 31.0, 32.5), errors=False) is None
+    stored = ResultFolder(folder, {}, {}, overwrite=False)
+    assert stored.surface(Camera(64, 64, 80.0, 80.0, 31.0, 32.5), errors=False) is None
     assert ": expected" in refusal(path, read_result, folder, "a")
 
 

@@ -3,7 +3,6 @@
 import math
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from methods_at_hand import AT_HAND
@@ -168,34 +167,6 @@ def test_depth_that_is_no_distance_is_refused(value: float) -> None:
         upsample_depth(_photo(48, 64), depth, _camera(48, 64))
 
 
-def test_invalid_picture_is_refused() -> None:
-    depth, camera = torch.ones(1, 12, 16), _camera(48, 64)
-    with pytest.raises(ValueError, match=r"rgb: expected shape \(3, 48, 64\), the camera's, got \(3, 48, 60\)"):
-        upsample_depth(_photo(48, 60), depth, camera)
-    with pytest.raises(ValueError, match=r"rgb: expected floating point values in \[0, 1\]"):
-        upsample_depth(255 * _photo(48, 64), depth, camera)
-    with pytest.raises(ValueError, match="at least one known pixel, all are holes"):
-        upsample_depth(_photo(48, 64), depth * torch.nan, camera)
-    with pytest.raises(ValueError, match="depth: expected floating point of shape"):
-        upsample_depth(_photo(48, 64), depth.int(), camera)
-    with pytest.raises(ValueError, match="device: expected auto, cpu or a device of this machine, got 'gpu'"):
-        upsample_depth(_photo(48, 64), depth, camera, device="gpu")
-
-
-def test_arrays_and_tensors_give_the_same_result() -> None:
-    camera, depth = _camera(48, 64), _plane(12, 16, _camera(48, 64)).float()
-    depth[0, 5, 5] = 1.0
-    bytes_ = (255 * _photo(48, 64)).round().to(torch.uint8)
-    of_tensors = dsr.upsample(bytes_, depth, camera)
-    known = depth[0].numpy() < 100
-    of_arrays = dsr.upsample(bytes_.permute(1, 2, 0).numpy(), depth[0].numpy(), camera, scale=4, mask=known)
-    assert isinstance(of_arrays, np.ndarray)
-    assert of_arrays.dtype == np.float32
-    np.testing.assert_allclose(of_arrays, of_tensors[0].numpy(), rtol=2e-6)  # the photo's layout in memory differs
-    floats = dsr.upsample(bytes_.permute(1, 2, 0).numpy() / 255, depth[0].numpy(), camera)
-    np.testing.assert_allclose(floats, of_arrays, rtol=1e-4)
-
-
 def test_result_without_any_depth_is_refused_rather_than_filled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "dsr.methods.classical.interpolation.Interpolation.interpolate",
@@ -216,16 +187,6 @@ def test_pixel_that_a_method_has_no_depth_for_stays_a_hole(monkeypatch: pytest.M
     camera = _camera(48, 64)
     fine = upsample_depth(_photo(48, 64), _plane(12, 16, camera), camera, method="bicubic")
     assert fine.isnan().nonzero().tolist() == [[0, 3, 5]]
-
-
-def test_mask_makes_holes() -> None:
-    camera, depth = _camera(48, 64), _plane(12, 16, _camera(48, 64))
-    mask = torch.ones(12, 16)
-    mask[4, 4] = 0
-    depth[0, 4, 4] = 0.01
-    fine = dsr.upsample(_photo(48, 64), depth.masked_fill(mask == 0, 5.0), camera, mask=mask, method="bicubic")
-    pierced = dsr.upsample(_photo(48, 64), depth.masked_fill(mask == 0, torch.nan), camera, method="bicubic")
-    torch.testing.assert_close(fine, pierced)
 
 
 @pytest.mark.parametrize("method", AT_HAND)

@@ -246,7 +246,7 @@ def test_saved_surface_is_a_result_of_the_command(surface: dsr.Surface[np.ndarra
     surface.save(tmp_path / "out", ["filled"])  # the same surface: a part is added
     assert (tmp_path / "out" / "mesh.glb").exists()
     other = dsr.Upsampler(QUICK)(photo(), metres(2), CAMERA)
-    with pytest.raises(ValueError, match=r"holds another result; take another folder, or overwrite=True"):
+    with pytest.raises(ValueError, match=r"other inputs: surface; take another folder, or overwrite=True"):
         other.save(tmp_path / "out", ["depth"])
     assert surface.save(tmp_path / "npy", ["depth"], format="npy")[0].name == "depth.npy"
     for wrong, message in (

@@ -13,9 +13,8 @@ import torch
 from rich.console import Console
 
 from dsr.app.requests import FuseRequest
-from dsr.app.upsample.outputs import INFO
 from dsr.app.upsample.parts import ERRORS
-from dsr.app.upsample.stored import read_camera, read_depth, read_errors, read_info, read_up
+from dsr.app.upsample.stored import INFO, read_camera, read_complete, read_depth, read_errors, read_up
 from dsr.geometry.poses import PosedMap, as_rigid, check_poses
 from dsr.geometry.tsdf import fuse_maps, suggest_voxel
 from dsr.io.exports import INPUT, read_input, world_comment, write_ply
@@ -67,7 +66,7 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
     except ValueError as error:
         raise ValueError(f"{frames[0]}{' and others' if len(frames) > 1 else ''}: {error}") from error
     colours = _colours(mesh.vertices, frames, max_error, _SEEN * voxel, problems)
-    ups = {read_up(read_info(folder / INFO)) for folder in frames}
+    ups = {read_up(read_complete(folder)) for folder in frames}
     comment = world_comment(ups.pop() if len(ups) == 1 else "")
     write_ply(request.output, mesh.vertices, colours, mesh.normals, mesh.faces, frame=comment)
     size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, voxels of {show_length(voxel)}"
@@ -95,15 +94,14 @@ def _difference(frames: Sequence[Path], max_error: float) -> str:
 
 def _load(folder: Path, max_error: float) -> PosedMap:
     """Return a result."""
-    path = folder / INFO
-    info = read_info(path)
+    path, info = folder / INFO, read_complete(folder)
     if info.get("pose") is None:
         raise ValueError(f"{path}: expected a pose; run `dsr upsample` on a capture with poses, or with --poses")
-    camera = read_camera(path, info)
+    camera = read_camera(folder, info)
     depth = read_depth(folder, camera).astype(np.float64)
     deviation = None
     if (folder / ERRORS).is_file():
-        deviation = np.maximum(read_errors(folder / ERRORS, camera)[0].astype(np.float64), _LEAST_ERROR)
+        deviation = np.maximum(read_errors(folder, camera)[0].astype(np.float64), _LEAST_ERROR)
         with np.errstate(invalid="ignore"):
             depth = np.where(deviation <= max_error * depth, depth, np.nan)
     return PosedMap(depth, camera, as_rigid(info["pose"], f"{path}: pose"), deviation)

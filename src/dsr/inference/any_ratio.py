@@ -64,12 +64,9 @@ class AnyRatio(Method):
     Args:
         recipe: the method.
         device: where to compute.
-        scale: the factor; None to choose it by the sizes, see :func:`dsr.inference.plans.plan_for`.
-        fill: which holes are filled: ``all``, the ``small`` ones, or ``none``; in others, pixels whose own depth, or
-            whose nearest low-resolution pixel, is missing stay NaN.
-        max_hole: width of the widest hole that counts as small, in degrees of view; one of 5 pixels always does.
-        working_size: by what ``facets`` without a scale divides the size of the map first, 1, 2, 4, 8 or 16; None to
-            choose it by the map's noise, see :mod:`dsr.inference.working_size`.
+        scale, fill, max_hole, working_size: see :class:`dsr.Upsampler`. Holes are pixels whose own depth, or whose
+            nearest low-resolution pixel, is missing. Without a working size ``facets`` chooses it, see
+            :mod:`dsr.inference.working_size`.
         precision: dtype of the convolutions; None for the device's fast one where that costs no accuracy.
         seed: of random numbers.
 

@@ -33,7 +33,6 @@ class Plan:
     coarsened: int  # the factor by which depth of the photo's own size is downsampled first; 1 for low-resolution depth
     way: str  # the sizes and the method in one line
     text: str  # the same, and the memory and time that it takes
-    seconds: float | None  # the time on two CPU cores; None where it is not known
 
 
 def steps_of(recipe: Recipe) -> Mapping[int, tuple[int, ...]]:
@@ -88,10 +87,9 @@ def plan_for(
     if len(steps) > 1:
         way += f" in two steps ({', '.join(f'x{step}' for step in steps)})"
     text = f"{way}, in about {abilities.cost.bytes_for(pixels, computed) / 2**30:.1f} GB of memory"
-    seconds = None if abilities.cost.seconds is None else abilities.cost.seconds * computed / 1e6
-    if seconds is not None:
-        text += f" and about {duration(max(seconds, 1))} on two CPU cores"
-    return Plan(method, chosen, steps, chosen if own else 1, way, text, seconds)
+    if abilities.cost.seconds is not None:
+        text += f" and about {duration(max(abilities.cost.seconds * computed / 1e6, 1))} on two CPU cores"
+    return Plan(method, chosen, steps, chosen if own else 1, way, text)
 
 
 def _ratio(photo_size: tuple[int, int], depth_size: tuple[int, int]) -> float:

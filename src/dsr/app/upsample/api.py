@@ -15,7 +15,7 @@ from torch import Tensor
 from dsr.app.upsample.arrays import Given, doubts_of, is_batch, picture_of, pictures_of
 from dsr.app.upsample.checks import align
 from dsr.app.upsample.frame import prepare, without_repeats
-from dsr.app.upsample.parts import as_stored
+from dsr.app.upsample.outputs import as_stored
 from dsr.app.upsample.sequence import camera_lr, nearest, vote
 from dsr.app.upsample.surface import Array, Surface
 from dsr.degradation.sensors import Identified
@@ -30,7 +30,6 @@ from dsr.notes import warn
 from dsr.utils.guards import naming
 from dsr.utils.progress import Steps
 
-_END = object()
 Maps = TypeVar("Maps", np.ndarray, Tensor, list[Any])
 
 
@@ -102,8 +101,7 @@ def upsample(
     found = []
     for number, each in enumerate(pictures_of(rgb, given, camera, mask)):
         with naming(f"picture {number} of the batch"):
-            surface = run(each.rgb, each.depth, each.camera, mask=each.mask, unit=unit, progress=progress)
-            found.append(surface.depth)
+            found.append(run(**each, unit=unit, progress=progress).depth)
     if isinstance(given, list | tuple):
         return found  # type: ignore[return-value]
     if not found:
@@ -227,23 +225,27 @@ class Upsampler:
     def _stream(
         self, frames: Iterable[tuple[Any, ...]], neighbours: int, unit: str | float | None
     ) -> Iterator[Surface[Any]]:
-        """Yield surfaces; as many frames are kept as may vote on one."""
-        source, kept, place = iter(frames), dict[int, Given | ValueError](), 0
+        """Yield surfaces; as many frames are kept as may vote on one.
+
+        A frame may be read ahead, for those before it; what is wrong with it is an error when its own turn comes.
+        """
+        source, place = iter(frames), 0
+        kept: dict[int, Given | ValueError] = {}
 
         def read_up_to(last: int) -> None:
-            while max(kept, default=place - 1) < last:
-                frame = next(source, _END)
-                if frame is _END:
-                    return
-                number = max(kept, default=place - 1) + 1
-                kept[number] = _frame(frame, number, unit)
+            numbers = range(max(kept, default=place - 1) + 1, last + 1)
+            for number, frame in zip(numbers, source, strict=False):
+                try:
+                    kept[number] = _read_frame(frame, number, unit)
+                except ValueError as error:
+                    kept[number] = error
 
         while True:
             read_up_to(place)
             given = kept.get(place)
             if given is None:
                 return
-            if isinstance(given, ValueError):  # read ahead, for those before it
+            if isinstance(given, ValueError):
                 raise given
             if neighbours and given.picture.pose is not None:
                 read_up_to(place + max(neighbours - place, -(-neighbours // 2)))
@@ -299,14 +301,6 @@ class Upsampler:
 def _is_empty(picture: Picture) -> bool:
     """Return whether a depth map has no measurement."""
     return bool(picture.depth_lr.isnan().all())
-
-
-def _frame(frame: Any, number: int, unit: str | float | None) -> Given | ValueError:
-    """Return a frame of a stream, or what is wrong with it."""
-    try:
-        return _read_frame(frame, number, unit)
-    except ValueError as error:
-        return error
 
 
 def _read_frame(frame: Any, number: int, unit: str | float | None) -> Given:

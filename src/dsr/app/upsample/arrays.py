@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,13 +28,7 @@ _METRES = Encoding(".npy", "float32", 1.0, math.nan, "orthogonal")
 
 @dataclass(frozen=True)
 class Given:
-    """A picture, and whether its depth was given as an array or a tensor.
-
-    Args:
-        picture: on the CPU.
-        device: of the tensor; None for an array.
-
-    """
+    """A picture on the CPU, and the device of its depth if that was given as a tensor."""
 
     picture: Picture
     device: torch.device | None
@@ -44,15 +38,9 @@ def picture_of(
     rgb: Any, depth: Any, camera: Any, *, mask: Any = None, unit: str | float | None = None, pose: Any = None,
     empty: bool = False,
 ) -> Given:  # fmt: skip
-    """Convert the user's arguments to a picture; see :func:`dsr.upsample`.
+    """Convert the user's arguments to a picture, see :func:`dsr.upsample`, whose depth may be ``empty``: all holes.
 
-    Args:
-        pose: from camera to world, (4, 4) or (3, 4), metres; None for none.
-        empty: whether the depth may be all holes.
-
-    Raises:
-        ValueError: something is not as there; the message begins with the argument's name.
-
+    The pose is from camera to world, (4, 4) or (3, 4), in metres. An error begins with the argument's name.
     """
     if not isinstance(camera, Camera):
         raise ValueError(f"camera: expected a dsr.Camera, got {_kind(camera)}; see dsr.Camera.from_matrix")
@@ -70,13 +58,10 @@ def picture_of(
         depth_lr = depth_lr.masked_fill(~_mask(mask, stored.shape), torch.nan)
     if not (empty and bool(depth_lr.isnan().all())):
         expect_picture(photo, depth_lr, camera)
-    place = (
-        None
-        if pose is None
-        else as_rigid(pose.detach().cpu().double().numpy() if isinstance(pose, Tensor) else pose, "pose")
-    )
+    if pose is not None:
+        pose = as_rigid(pose.detach().cpu().double().numpy() if isinstance(pose, Tensor) else pose, "pose")
     device = given.device if isinstance(given, Tensor) else None
-    return Given(Picture(photo, depth_lr, camera, encoding, (), place), device)
+    return Given(Picture(photo, depth_lr, camera, encoding, (), pose), device)
 
 
 def doubts_of(picture: Picture) -> list[Assumption]:
@@ -86,37 +71,23 @@ def doubts_of(picture: Picture) -> list[Assumption]:
     return [*doubt_camera(picture.camera, "camera", size_lr), *doubt_depth(picture.depth_lr, view, "orthogonal")]
 
 
-class Single(NamedTuple):
-    """One picture of a batch, or the only one."""
-
-    rgb: Any
-    depth: Any
-    camera: Any
-    mask: Any
-
-
 def is_batch(rgb: Any, depth: Any) -> bool:
     """Return whether there are several pictures: lists of them, or photos with an axis more."""
     return isinstance(rgb, list | tuple) or isinstance(depth, list | tuple) or getattr(rgb, "ndim", 0) == 4
 
 
-def pictures_of(rgb: Any, depth: Any, camera: Any, mask: Any) -> Iterator[Single]:
-    """Yield the pictures of a batch; one camera is that of all.
-
-    Raises:
-        ValueError: there are more of one argument than of another.
-
-    """
-    parts: dict[str, Sequence[Any]] = {"rgb": rgb, "depth": depth}
-    parts |= {"camera": camera} if isinstance(camera, list | tuple) else {}
-    parts |= {"mask": mask} if mask is not None else {}
-    counts = {name: len(each) if hasattr(each, "__len__") else 1 for name, each in parts.items()}
+def pictures_of(rgb: Any, depth: Any, camera: Any, mask: Any) -> Iterator[dict[str, Any]]:
+    """Yield the arguments of each picture of a batch, in which one camera is that of all; a ValueError for a lack."""
+    given = {"rgb": rgb, "depth": depth, "camera": camera, "mask": mask}
+    several = {"rgb": rgb, "depth": depth}
+    several |= {"camera": camera} if isinstance(camera, list | tuple) else {}
+    several |= {} if mask is None else {"mask": mask}
+    counts = {name: len(each) if hasattr(each, "__len__") else 1 for name, each in several.items()}
     if len(set(counts.values())) > 1:
         numbers = ", ".join(f"{count} of {name}" for name, count in counts.items())
         raise ValueError(f"{', '.join(counts)}: expected as many of each in a batch, got {numbers}")
     for number in range(counts["rgb"]):
-        of = {name: each[number] for name, each in parts.items()}
-        yield Single(of["rgb"], of["depth"], of.get("camera", camera), of.get("mask"))
+        yield {**given, **{name: each[number] for name, each in several.items()}}
 
 
 def _photo(rgb: Any, camera: Camera) -> Tensor:

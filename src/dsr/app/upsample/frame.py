@@ -2,302 +2,177 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
-import math
-import platform
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 from dsr.app.upsample.checks import align, check_together
 from dsr.app.upsample.frames import Frames
-from dsr.app.upsample.outputs import (
-    PreviousRun,
-    begin,
-    described,
-    expect_free,
-    finish,
-    kept_surface,
-    output_encoding,
-    read_previous_run,
-    stored_bytes,
-)
-from dsr.app.upsample.parts import METRES, PARTS, Result, as_stored, write_parts
-from dsr.app.upsample.reporting import Messages
+from dsr.app.upsample.outputs import Result, ResultFolder, as_stored, bytes_of
 from dsr.app.upsample.request import UpsampleRequest, Upsampling, files_of, inputs_with_neighbours
 from dsr.app.upsample.sequence import FrameSequence
+from dsr.app.upsample.stored import INFO, warnings_of
 from dsr.degradation.sensors import Identified
-from dsr.inference import AnyRatio, Plan, enlarged_by, find_filled, find_sensor
-from dsr.io.exports import FLAT
+from dsr.inference import AnyRatio, enlarged_by, find_filled, find_sensor
 from dsr.io.inputs import Picture, read_picture
 from dsr.io.pairs import Pair
 from dsr.methods.base import MapNoise, Surface
 from dsr.methods.glass import NOTED
-from dsr.notes import CHECKS, Assumption, expect_no_warning
+from dsr.notes import Assumption, expect_no_warning
+from dsr.utils.console import one_line
 from dsr.utils.guards import readable, refusing_excess
 from dsr.utils.processes import scene_lock
 from dsr.utils.progress import Progress, megabytes, show_length
-from dsr.utils.versions import package_versions
 
-TO_DO, COMPLETE = "to do", "complete already"
-"""Outcomes of a picture that is not computed."""
-_WHITE = 1.5
-"""Noise that is alike over fewer pixels counts as white."""
-_GLASS = 0.005
-"""Share of the pixels that look like glass from which it is said."""
-_PACKAGES = ("dsr", "torch", "numpy", "opencv-python-headless")
+Message = str | Sequence[Assumption]  # a line, or notes, of which those are shown that no earlier picture had
+Tell = Callable[[Message], object]
+_KEPT = 2**26  # numbers in the photos that were read last and are kept
+_WHITE = 1.5  # noise that is alike over fewer pixels counts as white
+_GLASS = 0.005  # share of the pixels that look like glass from which it is said
+
+
+class Done(NamedTuple):
+    """A picture that was worked on: the outcome with the bytes of its results, or the problem in one line."""
+
+    pair: Pair
+    target: Path
+    outcome: str = ""
+    size: int = 0
+    problem: str | None = None
 
 
 class FrameWork:
-    """Upsamples the pictures of a request, one at a time.
-
-    Args:
-        request: the request.
-        frames: all of its pictures, also those of other shards, which determine units and neighbours.
-
-    Attributes:
-        seconds: the time that the last picture of a dry run takes, on two CPU cores; None where it is not known.
-        bytes: the size of its results, or that of the last picture that is complete.
-
-    Raises:
-        ValueError: the file of poses is damaged, or does not fit the pictures.
-
-    """
+    """Upsamples the pictures of a request, one at a time; those of other shards are neighbours and determine units."""
 
     def __init__(self, request: UpsampleRequest, frames: Frames) -> None:
         self._request, self._frames = request, frames
-        self.seconds: float | None = None
-        self.bytes = 0.0
-        self._read_last: tuple[str, Picture] | None = None
+        self._pictures: OrderedDict[str, Picture] = OrderedDict()
         self._sequence = FrameSequence(frames.whole, self._read, request.frames.neighbours, request.frames.trajectory)
 
     def check_together(self, jobs: Sequence[tuple[Pair, Path]]) -> Frames:
-        """Return the frames with the warnings that concern several of them, if any frame is to be done.
-
-        Args:
-            jobs: the pictures to work on, each with the folder of its results.
-
-        """
-        if any(self.is_to_do(*job) for job in jobs):
-
-            def read(pair: Pair) -> Picture:
-                with refusing_excess():
-                    self._read_last = pair.name, self._read(pair)
-                return self._read_last[1]
-
-            frames = self._frames
-            warnings = check_together(frames.whole, self._request.reading, read, self._sequence)
-            self._frames = replace(frames, warnings=warnings)
+        """Return the frames with the warnings that concern several of them, if any of the jobs is to be done."""
+        if any(self._is_to_do(*job) for job in jobs):
+            warnings = check_together(self._frames.whole, self._request.reading, self._read, self._sequence)
+            self._frames = replace(self._frames, warnings=warnings)
         return self._frames
 
-    def __call__(self, pair: Pair, target: Path, reporter: Messages, progress: Progress) -> str:
-        """Upsample one picture, and return the outcome; commands that have it in common do so one after the other."""
-        job, output = self._job(pair, target), self._request.results.output
-        if self._request.results.dry_run or job.is_done():
-            return self._work(job, reporter, progress)
-        with scene_lock(output, str(target.relative_to(output))):
-            return self._work(replace(job, earlier=read_previous_run(target)), reporter, progress)
+    def __call__(self, pair: Pair, target: Path, tell: Tell, progress: Progress) -> Done:
+        """Upsample a picture; an error is its problem, and other pictures go on."""
+        wanted = self._request.results
+        try:
+            with refusing_excess(), contextlib.ExitStack() as stack:
+                folder = self._folder(pair, target)
+                if not wanted.dry_run and not self._is_done(folder):
+                    stack.enter_context(scene_lock(wanted.output, str(target.relative_to(wanted.output))))
+                    folder.look()  # another command may have been at work there
+                return self._work(pair, folder, tell, progress)
+        except (ValueError, OSError) as error:
+            return Done(pair, target, problem=one_line(error))
 
-    def is_to_do(self, pair: Pair, target: Path) -> bool:
+    def _work(self, pair: Pair, folder: ResultFolder, tell: Tell, progress: Progress) -> Done:
+        """Upsample a picture that no other command is at."""
+        request, wanted, how = self._request, self._request.results, self._request.upsampling
+        folder.expect_agreement()
+        if self._is_done(folder):
+            warnings = warnings_of(folder.earlier)
+            self._expect_no_warning(pair, folder, warnings)
+            tell(warnings)
+            tell(f"{pair.name}: complete already, in {folder.path}")
+            return Done(pair, folder.path, "complete already", bytes_of(folder.path, folder.earlier["files"]))
+        progress.stage("reading")
+        begun = time.perf_counter()
+        picture = self._read(pair)
+        picture = replace(picture, assumptions=(*picture.assumptions, *self._frames.warnings.get(pair.name, ())))
+        picture, sensor = prepare(picture, how.sensor, functools.partial(self._sequence.fuse, pair))
+        picture = align(picture, register=request.reading.register)
+        size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
+        planned = self._upsampler.plan((picture.camera.height, picture.camera.width), size_lr)
+        self._expect_no_warning(pair, folder, picture.assumptions)
+        tell(picture.assumptions)
+        if wanted.dry_run:
+            tell(f"{pair.name}: {planned.text} -> {folder.path}")
+            return Done(pair, folder.path, "to do")
+        folder.expect_free(files_of(pair, request.reading).values())
+        progress.stage("upsampling")
+        read = time.perf_counter()
+        kept = folder.surface(picture.camera, errors=any(part.errors for part in wanted.of_frame))
+        if kept is None:
+            with progress.task("steps") as step:
+                surface = self._upsampler.upsample(picture.rgb, picture.depth_lr, picture.camera, step, sensor)
+            surface = as_stored(surface.map(lambda values: values.cpu()))
+            tell(_describe(surface, how))
+            surface = surface.without_dubious(wanted.max_error / 100) if wanted.certain else surface
+        else:
+            surface = kept._replace(filled=find_filled(kept.depth, picture.depth_lr))
+        progress.stage("writing")
+        result = Result(picture, surface, planned, wanted, readable(pair.name))
+        seconds = {"reading": read - begun, "upsampling": time.perf_counter() - read}
+        stored = folder.store(result, seconds, reused=kept is not None)
+        tell(stored.notes)
+        brief = [f"{planned.method} x{planned.scale}", *_in_brief(surface.noise, result.shares)]
+        brief += [f"{stored.seconds['total']:.1f} s", megabytes(stored.size)]
+        tell(f"{pair.name}: {', '.join(brief)} -> {folder.path}")
+        return Done(pair, folder.path, "done", stored.size)
+
+    def _folder(self, pair: Pair, target: Path) -> ResultFolder:
+        """Return the folder of a picture's results, with what these depend on."""
+        inputs = inputs_with_neighbours(self._request, pair, self._sequence.neighbours(pair))
+        return ResultFolder(target, inputs, self._request.settings, overwrite=self._request.results.overwrite)
+
+    def _is_done(self, folder: ResultFolder) -> bool:
+        return folder.is_done(self._request.results, checked=self._request.reading.strict)
+
+    def _is_to_do(self, pair: Pair, target: Path) -> bool:
         """Return whether a picture is not complete; one that cannot be read is reported when its turn comes."""
         try:
-            return read_previous_run(target) is None or not self._job(pair, target).is_done()
+            return not (target / INFO).is_file() or not self._is_done(self._folder(pair, target))
         except (ValueError, OSError):
             return True
 
-    def _job(self, pair: Pair, target: Path) -> _Job:
-        """Return what there is to do for a picture."""
-        depends_on = inputs_with_neighbours(self._request, pair, self._sequence.neighbours(pair))
-        return _Job(self._request, pair, target, self._request.settings, depends_on, read_previous_run(target))
-
-    def _work(self, job: _Job, reporter: Messages, progress: Progress) -> str:
-        """Upsample a picture that no other command is at, and return the outcome."""
-        request, sequence, pair, target = self._request, self._sequence, job.pair, job.target
-        how, wanted = request.upsampling, request.results
-        job.expect_agreement()
-        if job.is_done():
-            earlier, files = ((), ()) if job.earlier is None else (job.earlier.warnings, job.earlier.files)
-            job.expect_no_warning(earlier)
-            self.bytes = stored_bytes(target, files)
-            reporter.facts(earlier)
-            reporter.say(f"{pair.name}: {COMPLETE}, in {target}")
-            return COMPLETE
-        times = Times(progress)
-        times.begin("reading")
-        picture = self._read(pair)
-        picture = replace(picture, assumptions=(*picture.assumptions, *self._frames.warnings.get(pair.name, ())))
-        picture, identified = prepare(picture, how.sensor, functools.partial(sequence.fuse, pair))
-        picture = align(picture, register=request.reading.register)
-        size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
-        size = (picture.camera.height, picture.camera.width)
-        planned = self._upsampler.plan(size, size_lr)
-        job.expect_no_warning(picture.assumptions)
-        reporter.facts(picture.assumptions)
-        if wanted.dry_run:
-            self.bytes, writing = wanted.cost(math.prod(size))
-            self.seconds = None if planned.seconds is None else planned.seconds + writing
-            reporter.say(f"{pair.name}: {planned.text}, about {megabytes(self.bytes)} -> {target}")
-            return TO_DO
-        inputs = files_of(pair, request.reading).values()
-        expect_free(target, inputs, ours=wanted.overwrite or job.earlier is not None)
-        errors = any(part.errors for part in wanted.of_frame)
-        surface = kept_surface(target, picture.camera, errors=errors) if job.reusable else None
-        times.begin("upsampling")
-        if surface is not None and job.earlier is not None:
-            times.kept = job.earlier.seconds
-            surface = surface._replace(filled=find_filled(surface.depth, picture.depth_lr))
-        else:
-            surface = as_stored(self._upsample(picture, identified, progress))
-            reporter.facts(_describe(surface, how))
-            if wanted.certain:
-                surface = surface.without_dubious(wanted.max_error / 100)
-        times.begin("writing")
-        begin(target, job.settings, job.inputs, () if job.earlier is None else job.earlier.files)
-        title = f"{readable(pair.name)}, {planned.method} x{planned.scale}"
-        result = Result(picture, surface, output_encoding(picture.encoding, wanted.format), title, wanted)
-        kept = job.earlier if job.same else None
-        facts, seconds, self.bytes = write_result(
-            target, result, planned, times, job.inputs, job.settings, job.earlier, kept
-        )
-        reporter.facts(facts)
-        brief = _in_brief(surface.noise, result.shares)
-        brief += [f"{seconds['total']:.1f} s", megabytes(self.bytes)]
-        reporter.say(f"{pair.name}: {', '.join([f'{planned.method} x{planned.scale}', *brief])} -> {target}")
-        return "done"
+    def _expect_no_warning(self, pair: Pair, folder: ResultFolder, notes: Sequence[Assumption]) -> None:
+        """Raise ValueError if one is a warning, and that is not allowed; with one line for all frames of a folder."""
+        if self._request.reading.strict:
+            several = folder.path != self._request.results.output
+            expect_no_warning(str(pair.depth.parent if several else pair.depth), notes, brief=several)
 
     @functools.cached_property
     def _upsampler(self) -> AnyRatio:
         """The method, whose weights are loaded once."""
         return self._request.upsampling.upsampler()
 
-    def _upsample(self, picture: Picture, sensor: Identified | None, progress: Progress) -> Surface:
-        """Compute the high-resolution depth with its expected errors, on the CPU."""
-        with progress.task("steps") as step:
-            surface = self._upsampler.upsample(picture.rgb, picture.depth_lr, picture.camera, step, sensor)
-        return surface.map(lambda values: values.cpu())
-
     def _read(self, pair: Pair) -> Picture:
-        """Read a picture, unless it was the last one that the checks read."""
-        last, self._read_last = self._read_last, None
-        if last is not None and last[0] == pair.name:
-            return last[1]
-        return without_repeats(read_picture(pair, self._request.reading, self._frames.units))
-
-
-class Times:
-    """Measures the seconds of each stage of a picture and shows which one begins; some may be known beforehand.
-
-    Attributes:
-        kept: the seconds of an earlier run whose result is kept, which :meth:`together` counts, too.
-
-    """
-
-    def __init__(self, progress: Progress, **seconds: float) -> None:
-        self._progress, self._seconds = progress, {stage: round(each, 3) for stage, each in seconds.items()}
-        self._stage, self._since = "", 0.0
-        self.kept: Mapping[str, float] = {}
-
-    def begin(self, stage: str) -> None:
-        """Begin reading, upsampling or writing."""
-        self.read()
-        self._stage, self._since = stage, time.perf_counter()
-        self._progress.stage(stage)
-
-    def read(self) -> dict[str, float]:
-        """Return the seconds of each stage so far, to milliseconds, and their sum as ``total``."""
-        if self._stage:
-            self._seconds[self._stage] = round(time.perf_counter() - self._since, 3)
-        return _with_total(self._seconds)
-
-    def together(self, seconds: Mapping[str, float]) -> dict[str, float]:
-        """Return the seconds from :meth:`read` plus :attr:`kept`."""
-        stages = dict.fromkeys((*self.kept, *seconds))
-        return _with_total({name: self.kept.get(name, 0.0) + seconds.get(name, 0.0) for name in stages})
-
-
-def _with_total(seconds: Mapping[str, float]) -> dict[str, float]:
-    """Return the seconds of stages, to milliseconds, with their sum as ``total``."""
-    found = {name: round(each, 3) for name, each in seconds.items() if name != "total"}
-    return {**found, "total": round(sum(found.values()), 3)}
-
-
-@dataclass(frozen=True)
-class _Job:
-    """One picture, and the earlier run in its folder, if any."""
-
-    request: UpsampleRequest
-    pair: Pair
-    target: Path
-    settings: Mapping[str, Any]
-    inputs: Mapping[str, Any]
-    earlier: PreviousRun | None
-
-    @property
-    def reusable(self) -> bool:
-        """Whether the earlier run finished with the same inputs and settings, and may be kept."""
-        return self.earlier is not None and self.earlier.complete and self.same and not self.request.results.overwrite
-
-    @property
-    def same(self) -> bool:
-        """Whether the earlier run had the same inputs and settings."""
-        return self.earlier is not None and (self.earlier.settings, self.earlier.inputs) == (self.settings, self.inputs)
-
-    def expect_agreement(self) -> None:
-        """Raise ValueError if the folder holds a complete result of other inputs or settings."""
-        earlier = self.earlier
-        if earlier is None or not earlier.complete or self.same or self.request.results.overwrite:
-            return
-        if earlier.inputs != self.inputs:
-            what = "other inputs: " + ", ".join(str(entry.get("file")) for entry in earlier.inputs.values())
-        else:
-            changed = [name for name, value in self.settings.items() if earlier.settings.get(name) != value]
-            said = ((name, earlier.settings.get(name)) for name in changed)
-            what = "other settings: " + ", ".join(
-                f"no {name}" if old is None else f"{name} {old}" for name, old in said
-            )
-        raise ValueError(f"{self.target}: holds a result of {what}; take another -o, or --overwrite")
-
-    def expect_no_warning(self, notes: Sequence[Assumption]) -> None:
-        """Raise ValueError if one is a warning, and that is not allowed; with one line for all frames of a folder."""
-        if self.request.reading.strict:
-            several = self.target != self.request.results.output
-            where = self.pair.depth.parent if several else self.pair.depth
-            expect_no_warning(str(where), notes, brief=several)
-
-    def is_done(self) -> bool:
-        """Return whether all requested parts exist as wanted, and were checked as now if no warning is allowed.
-
-        A mesh of large triangles is none of every pixel; the other one serves for both.
-        """
-        if not self.reusable or self.earlier is None:
-            return False
-        if self.request.reading.strict and self.earlier.checks != CHECKS:
-            return False
-        wanted = self.request.results
-        there = {name for name in self.earlier.files if (self.target / name).is_file()}
-        if METRES not in there and any(part.name == "depth" for part in wanted.of_frame):
-            return False
-        shapes = [self.earlier.shapes.get(part.name) for part in wanted.of_frame]
-        if wanted.keep == "all" and any(isinstance(shape, dict) and shape.get("how") == FLAT for shape in shapes):
-            return False
-        return all(there & set(part.files) for part in wanted.of_frame)
+        """Return a picture; the last ones are kept, for the checks, for the frames that they vote on and their own."""
+        if pair.name not in self._pictures:
+            with refusing_excess():
+                picture = read_picture(pair, self._request.reading, self._frames.units)
+                self._pictures[pair.name] = without_repeats(picture)
+        self._pictures.move_to_end(pair.name)
+        while len(self._pictures) > 1 and sum(each.rgb.numel() for each in self._pictures.values()) > _KEPT:
+            self._pictures.popitem(last=False)
+        return self._pictures[pair.name]
 
 
 def prepare(picture: Picture, sensor: str, fuse: Callable[[Picture], Picture]) -> tuple[Picture, Identified | None]:
-    """Return a picture fused with its neighbours, and the sensor identified from its own depth as read.
-
-    Args:
-        sensor: see :func:`dsr.inference.find_sensor`.
-        fuse: fuses it with its neighbours.
-
-    """
+    """Return a picture that ``fuse`` has fused with its neighbours, and the sensor that its depth as read shows."""
     try:
         identified = find_sensor(picture.depth_lr, sensor, picture.device_name)
     except ValueError as error:
         raise ValueError(f"--{error}") from error
-    return _with_sensor(fuse(picture), identified), identified
+    picture = fuse(picture)
+    if identified is None or identified.by == "request":
+        return picture, identified
+    reason = (
+        f"named {picture.device_name}"
+        if identified.by == "file"
+        else f"by its depth in steps of disparity with f B / step = {identified.constant:.0f} m"
+    )
+    fact = Assumption("sensor", f"{identified.sensor.name}, {reason}; --sensor overrides it")
+    return replace(picture, assumptions=(*picture.assumptions, fact)), identified
 
 
 def without_repeats(picture: Picture) -> Picture:
@@ -310,19 +185,6 @@ def without_repeats(picture: Picture) -> Picture:
     depth_lr = picture.depth_lr[:, ::block, ::block]
     confidence = None if picture.confidence is None else picture.confidence[:, ::block, ::block]
     return replace(picture, depth_lr=depth_lr, confidence=confidence, assumptions=(*picture.assumptions, fact))
-
-
-def _with_sensor(picture: Picture, identified: Identified | None) -> Picture:
-    """Return a picture with a note on the sensor, if it is known and was not given."""
-    if identified is None or identified.by == "request":
-        return picture
-    reason = (
-        f"named {picture.device_name}"
-        if identified.by == "file"
-        else f"by its depth in steps of disparity with f B / step = {identified.constant:.0f} m"
-    )
-    fact = Assumption("sensor", f"{identified.sensor.name}, {reason}; --sensor overrides it")
-    return replace(picture, assumptions=(*picture.assumptions, fact))
 
 
 def _describe(surface: Surface, how: Upsampling) -> list[Assumption]:
@@ -364,53 +226,3 @@ def _in_brief(noise: MapNoise | None, shares: Mapping[str, float]) -> list[str]:
             percent = f"{min(max(round(100 * share, 1), 0.1), 99.9):g}%" if share < 1 else f"{share:.0%}"
             brief.append(f"{words.get(name, name)} {percent}")
     return brief
-
-
-def write_result(
-    folder: Path, result: Result, planned: Plan, times: Times, inputs: Mapping[str, Any],
-    settings: Mapping[str, Any], earlier: PreviousRun | None = None, kept: PreviousRun | None = None,
-) -> tuple[list[Assumption], dict[str, float], int]:  # fmt: skip
-    """Write the parts of a result and ``info.json``, and return notes, the seconds of the stages, and the size.
-
-    Args:
-        folder: of the result.
-        planned, times: how the result was computed, and how long that took.
-        inputs, settings: what it depends on, as values for JSON.
-        earlier: the run whose files are in the folder.
-        kept: that run, if its other files stay.
-
-    """
-    picture, surface = result.picture, result.surface
-    outputs = write_parts(folder, result)
-    files = [name for output in outputs.values() for name in output.files]
-    facts = list(dict.fromkeys(note for output in outputs.values() for note in output.notes))
-    shapes = {
-        name: output.shape._asdict()
-        for output in outputs.values() if output.shape is not None
-        for name in outputs if set(PARTS[name].files) & set(output.files)
-    }  # fmt: skip
-    counts = {name: shape for name, shape in (kept.shapes if kept else {}).items() if name not in outputs} | shapes
-    if surface.outliers is not None:
-        counts["outliers"] = surface.outliers._asdict()
-    others = [name for name in (kept.files if kept else ()) if name not in files]
-    notes = (*picture.assumptions, *facts)
-    texts = tuple(note.text for note in notes)
-    said = [each for each in (kept.said if kept and others else ()) if not each.startswith(texts)]
-    shares = {name: round(share, 6) for name, share in result.shares.items()}
-    entries = {
-        "inputs": inputs,
-        "settings": settings,
-        "method": planned.method,
-        "scale": planned.scale,
-        "plan": planned.text,
-        "noise": surface.noise._asdict() if surface.noise else kept.noise if kept else None,
-        **described(picture, result.encoding),
-        **counts,
-        "shares": {**(kept.shares if kept else {}), **shares},
-        "assumptions": [*map(str, notes), *said],
-        "checks": CHECKS,
-        "warnings": [fact.record() for fact in notes if fact.code],
-        "seconds": times.together(seconds := times.read()),
-        "versions": {"python": platform.python_version(), **package_versions(_PACKAGES)},
-    }
-    return facts, seconds, finish(folder, earlier, entries, [*files, *others])

@@ -27,21 +27,13 @@ from dsr.utils.guards import path_within
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames to work on, and what they depend on.
+    """Frames to work on, and what they depend on."""
 
-    Args:
-        found: the frames to work on, and notes on them.
-        whole: all frames that were found; poses, neighbours and units depend on them.
-        single: whether there is a single picture, whose results are in the output folder itself.
-        units: units and range types, identified from the values of all of them.
-        warnings: warnings from checks of several frames, by the name of each; see :mod:`dsr.app.upsample.checks`.
-
-    """
-
-    found: PairingResult
-    whole: tuple[Pair, ...]
-    single: bool
-    units: FolderUnits
+    found: PairingResult  # the frames to work on, and notes on them
+    whole: tuple[Pair, ...]  # all frames that were found; poses, neighbours and units depend on them
+    single: bool  # whether there is a single picture, whose results are in the output folder itself
+    units: FolderUnits  # units and range types, identified from the values of all of them
+    # of :mod:`dsr.app.upsample.checks`, which looks at several frames, by the name of each frame
     warnings: Mapping[str, tuple[Assumption, ...]] = field(default_factory=dict)
 
     def target(self, output: Path, pair: Pair) -> Path:
@@ -50,12 +42,7 @@ class Frames:
 
 
 def find_frames(request: UpsampleRequest) -> Frames:
-    """Return the frames of a request.
-
-    Raises:
-        ValueError: there are none.
-
-    """
+    """Return the frames of a request; a ValueError if there are none."""
     choice = request.frames
     found = _search(choice, request.results.output)
     if choice.confidence:

@@ -1,199 +1,268 @@
-"""The folder of one result: the files of a result, those of an earlier run, and ``info.json``."""
+"""The folder of one result: its parts are written, and what it depends on is compared with an earlier run's."""
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+import platform
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from dsr.app.upsample.parts import ERRORS, FILES, METRES, PARTS
-from dsr.evaluation.results import load_errors
+from dsr.app.upsample.parts import ERRORS, FILES, METRES, PARTS, Results
+from dsr.app.upsample.stored import INFO, read_depth, read_errors, read_info
 from dsr.geometry.camera import Camera
-from dsr.io.depth_files import read_depth_file, storable
-from dsr.io.encoding import IN_METRES, Encoding
+from dsr.geometry.mesh import ERROR_SHARE, FLATNESS
+from dsr.inference import Plan
+from dsr.io.depth_files import storable, write_depth_file
+from dsr.io.encoding import IN_METRES, Encoding, encode
+from dsr.io.exports import (
+    FLAT,
+    INPUT,
+    Written,
+    write_cloud,
+    write_input,
+    write_mask,
+    write_mesh,
+    write_normals,
+    write_renderings,
+)
 from dsr.io.inputs import Picture
+from dsr.io.open3d import write_rgbd
+from dsr.io.scene_files import RGBD
 from dsr.methods.base import Surface
-from dsr.notes import Assumption, read_warning
-from dsr.sample import FARTHEST, NEAREST
-from dsr.utils.files import expect_targets, write_text
-from dsr.utils.guards import parse_json, pixels_beside, read_limited
+from dsr.notes import CHECKS, Assumption
+from dsr.utils.files import expect_targets, replacing, write_text
+from dsr.utils.versions import package_versions
 
-INFO = "info.json"
-_SHAPES = tuple(part.name for part in PARTS.values() if part.shape)
+_ERROR_STEPS = 2**6  # expected errors are stored with so many steps below each power of two: off by less than 2 %
+_WORTH_SAYING = 1e-3  # smallest fraction of the pixels that is reported as left out
+_PACKAGES = ("dsr", "torch", "numpy", "opencv-python-headless")
 
 
 @dataclass(frozen=True)
-class PreviousRun:
-    """An earlier run, as recorded in ``info.json``.
+class Result:
+    """A result to write, and the parts that are requested."""
 
-    Args:
-        complete: whether it finished.
-        settings, inputs: those of the run, as JSON has them.
-        files: names of the files that it wrote.
-        noise: that of its input, as JSON has it; None if it was not estimated.
-        shapes: numbers of points and triangles of its cloud and mesh, and of its outliers.
-        warnings: that it gave.
-        checks: number of the checks that gave them, see :data:`dsr.notes.CHECKS`.
-        said: its assumptions and notes, without warnings.
-        shares: of the pixels, see :meth:`dsr.methods.base.Surface.shares`.
-        seconds: of its stages.
+    picture: Picture
+    surface: Surface  # the depth with its expected errors, see :func:`as_stored`
+    plan: Plan
+    wanted: Results
+    name: str = ""  # of the picture, in titles
 
-    """
+    @functools.cached_property
+    def encoding(self) -> Encoding:
+        """How the result is stored: as the input in the input's format, else in metres, or in whole millimetres.
 
-    complete: bool
-    settings: Mapping[str, Any]
-    inputs: Mapping[str, Any]
-    files: tuple[str, ...]
-    noise: Mapping[str, Any] | None = None
-    shapes: Mapping[str, Any] = field(default_factory=dict)
-    warnings: tuple[Assumption, ...] = ()
-    checks: object = None
-    said: tuple[str, ...] = ()
-    shares: Mapping[str, float] = field(default_factory=dict)
-    seconds: Mapping[str, float] = field(default_factory=dict)
+        It is :data:`dsr.io.encoding.IN_METRES` itself where the input's values are such and no format is chosen. Of
+        whole numbers of 64 bits, which a TIFF may have and no writer writes, it has 32.
+        """
+        encoding, chosen = self.picture.encoding, self.wanted.format
+        of_metres = replace(encoding, suffix=IN_METRES.suffix, hole=0.0) == replace(IN_METRES, hole=0.0)
+        if chosen is None and of_metres and math.isnan(encoding.hole):
+            return IN_METRES
+        own = "tiff" if encoding.suffix == ".tif" else encoding.suffix[1:]
+        if chosen in (None, own):
+            return replace(encoding, dtype=str(storable(encoding.suffix, np.dtype(encoding.dtype))))
+        if chosen in ("png", "mm"):
+            return Encoding(".png", "uint16", 1e-3, 0.0, "orthogonal")
+        return Encoding(f".{chosen}", "float32", 1.0, math.nan, "orthogonal")
 
+    @functools.cached_property
+    def shares(self) -> dict[str, float]:
+        """The shares of the pixels, see :meth:`dsr.methods.base.Surface.shares`."""
+        return self.surface.shares(self.wanted.max_error / 100)
 
-def output_encoding(encoding: Encoding, chosen: str | None) -> Encoding:
-    """Return how the result is stored: as the input in the input's format, else in metres, or in whole millimetres.
-
-    It is :data:`dsr.io.encoding.IN_METRES` itself where the input's values are such and no format is chosen. Of whole
-    numbers of 64 bits, which a TIFF may have and no writer writes, it has 32.
-
-    Args:
-        encoding: the input's.
-        chosen: one of :data:`dsr.app.upsample.parts.FORMATS`; None for the input's.
-
-    """
-    if (
-        chosen is None
-        and replace(encoding, suffix=IN_METRES.suffix, hole=0.0) == replace(IN_METRES, hole=0.0)
-        and (math.isnan(encoding.hole))
-    ):
-        return IN_METRES
-    own = "tiff" if encoding.suffix == ".tif" else encoding.suffix[1:]
-    if chosen in (None, own):
-        return replace(encoding, dtype=str(storable(encoding.suffix, np.dtype(encoding.dtype))))
-    if chosen in ("png", "mm"):
-        return Encoding(".png", "uint16", 1e-3, 0.0, "orthogonal")
-    return Encoding(f".{chosen}", "float32", 1.0, math.nan, "orthogonal")
+    @functools.cached_property
+    def certain(self) -> tuple[Tensor | None, tuple[Assumption, ...]]:
+        """The depth, (1, H, W), without pixels that are likely to be wrong, None if none is left; and notes."""
+        limit, notes = self.wanted.max_error / 100, list[Assumption]()
+        depth, share = self.surface.without_dubious(limit).depth, self.shares.get("dubious", 0.0)
+        if share >= _WORTH_SAYING:
+            text = f"{share:.1%} of the pixels, expected to be off by more than {limit:.1%} of their depth"
+            notes.append(Assumption("left out of cloud and mesh", text))
+        if bool(depth.isfinite().any()):
+            return depth, tuple(notes)
+        return None, (*notes, Assumption("no cloud and no mesh", "no pixel is left"))
 
 
-def read_previous_run(folder: Path) -> PreviousRun | None:
-    """Read what an earlier run left in a folder; None if there was none.
+class Output(NamedTuple):
+    """What a part wrote: the names of the files, notes for the user, and how much of a shape."""
 
-    Raises:
-        ValueError: there is an ``info.json`` that `dsr upsample` did not write.
-
-    """
-    path = folder / INFO
-    if not path.is_file():
-        return None
-    try:
-        entries = parse_json(read_limited(path), finite=False)
-        noise, files, inputs = entries.get("noise"), entries["files"], dict(entries["inputs"])
-        if not isinstance(files, list) or not all(isinstance(name, str) for name in files):
-            raise TypeError(f"files: expected names, got {files!r}")
-        if not all(isinstance(entry, dict) for entry in inputs.values()):
-            raise TypeError(f"inputs: expected facts of each, got {inputs!r}")
-        return PreviousRun(
-            entries["complete"] is True,
-            dict(entries["settings"]),
-            inputs,
-            tuple(files),
-            None if noise is None else dict(noise),
-            {name: entries[name] for name in (*_SHAPES, "outliers") if name in entries},
-            tuple(read_warning(each) for each in entries.get("warnings", ())),
-            entries.get("checks"),
-            tuple(text for text in map(str, entries.get("assumptions", ())) if not text.startswith("warning: ")),
-            _numbers(entries, "shares"),
-            {stage: seconds for stage, seconds in _numbers(entries, "seconds").items() if stage != "total"},
-        )
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else; take another -o") from error
+    files: Sequence[str]
+    notes: Sequence[Assumption] = ()
+    shape: Written | None = None
 
 
-def expect_free(folder: Path, inputs: Iterable[Path], *, ours: bool) -> None:
-    """Check that a result would not overwrite its input, files that no earlier run wrote, or things that are no files.
+class Stored(NamedTuple):
+    """A result that was written: notes on its parts, the seconds of all stages, and the bytes of its files."""
 
-    Args:
-        folder: the result's folder.
-        inputs: files that must not be overwritten.
-        ours: whether existing results may be replaced.
+    notes: Sequence[Assumption]
+    seconds: Mapping[str, float]
+    size: int
 
-    Raises:
-        ValueError: it would overwrite one of them, or a file outside of the folder.
-        TargetError: a link, a device, a pipe or a socket is in the place of one.
+
+class ResultFolder:
+    """The folder of a result, what the result depends on, as values for JSON, and the earlier run in it.
+
+    Attributes:
+        earlier: the ``info.json`` of the earlier run; empty without one.
 
     """
-    expect_targets(folder, (*FILES, INFO))
-    there = [folder / name for name in (*FILES, INFO) if (folder / name).exists()]
-    for path in there:
-        if any(path.samefile(other) for other in inputs):
-            raise ValueError(f"{path}: the result would overwrite its input; take another -o")
-    if there and not ours:
-        raise ValueError(f"{there[0]}: is there already and not of an earlier run; take another -o, or --overwrite")
 
+    def __init__(self, path: Path, inputs: Mapping[str, Any], settings: Mapping[str, Any], *, overwrite: bool) -> None:
+        self.path, self.inputs, self.settings, self.overwrite = path, inputs, settings, overwrite
+        self.look()
 
-def kept_surface(folder: Path, camera: Camera, *, errors: bool) -> Surface | None:
-    """Load the result of an earlier complete run; None if a file of it is missing.
+    def look(self) -> None:
+        """Read what an earlier run has left; a ValueError if that is not of `dsr upsample`."""
+        self.earlier: Mapping[str, Any] = read_info(self.path) or {}
 
-    Args:
-        folder: the result's folder.
-        camera: the photo's.
-        errors: whether its expected errors are needed, which are loaded if they are there.
+    @property
+    def same(self) -> bool:
+        """Whether the earlier run had the same inputs and settings."""
+        return (self.earlier.get("inputs"), self.earlier.get("settings")) == (self.inputs, self.settings)
 
-    """
-    size = (camera.height, camera.width)
-    with contextlib.suppress(OSError, ValueError):
-        values = read_depth_file(folder / METRES, pixels_beside(*size))
-        if values.shape != size or values.dtype != np.float32:
+    @property
+    def reusable(self) -> bool:
+        """Whether the earlier run is complete and had the same inputs and settings, and is to be kept."""
+        return self.same and self.earlier["complete"] and not self.overwrite
+
+    def expect_agreement(self, cure: str = "take another -o, or --overwrite") -> None:
+        """Raise ValueError, with a cure, if the folder holds a complete result of other inputs or settings."""
+        earlier = self.earlier
+        if not earlier.get("complete") or self.same or self.overwrite:
+            return
+        if earlier["inputs"] != self.inputs:
+            names = (str(entry.get("file", name)) for name, entry in earlier["inputs"].items())
+            what = f"other inputs: {', '.join(names)}"
+        else:
+            before = {name: earlier["settings"].get(name) for name in self.settings}
+            changed = [name for name, value in self.settings.items() if before[name] != value]
+            said = (f"no {name}" if before[name] is None else f"{name} {before[name]}" for name in changed)
+            what = f"other settings: {', '.join(said)}"
+        raise ValueError(f"{self.path}: holds a result of {what}; {cure}")
+
+    def expect_free(self, sources: Iterable[Path] = ()) -> None:
+        """Check that a result would not overwrite its sources, files that no earlier run wrote, or a link or device."""
+        expect_targets(self.path, (*FILES, INFO))
+        there = [self.path / name for name in (*FILES, INFO) if (self.path / name).exists()]
+        for path in there:
+            if any(path.samefile(source) for source in sources):
+                raise ValueError(f"{path}: the result would overwrite its input; take another -o")
+        if there and not self.earlier and not self.overwrite:
+            raise ValueError(f"{there[0]}: is there already and not of an earlier run; take another -o, or --overwrite")
+
+    def is_done(self, wanted: Results, *, checked: bool) -> bool:
+        """Return whether all requested parts exist as wanted, by a run that was ``checked`` as now if that counts.
+
+        A mesh of large triangles is none of every pixel; the other one serves for both.
+        """
+        if not self.reusable or (checked and self.earlier.get("checks") != CHECKS):
+            return False
+        there = {name for name in self.earlier["files"] if (self.path / name).is_file()}
+        if METRES not in there and any(part.name == "depth" for part in wanted.of_frame):
+            return False
+        shapes = [self.earlier.get(part.name) for part in wanted.of_frame if part.shape]
+        if wanted.keep == "all" and any(isinstance(shape, dict) and shape.get("how") == FLAT for shape in shapes):
+            return False
+        return all(there & set(part.files) for part in wanted.of_frame)
+
+    def surface(self, camera: Camera, *, errors: bool) -> Surface | None:
+        """Return the stored result if it is reusable; None if a file of it, that of the errors if needed, is lost."""
+        if not self.reusable:
             return None
-        depth = torch.from_numpy(values)[None]
-        if not bool((depth > 0).any()) or bool(((depth < NEAREST) | (depth > FARTHEST)).any()):
+        try:
+            depth = torch.from_numpy(read_depth(self.path, camera))[None]
+        except (OSError, ValueError):
             return None
-        expected = None
-        with contextlib.nullcontext() if errors else contextlib.suppress(OSError, ValueError):
-            expected = load_errors(folder / ERRORS)
-        if expected is not None and all(each.shape == depth.shape for each in expected):
-            return Surface(depth, *expected)
-        return None if errors else Surface(depth)
-    return None
+        try:
+            depth_error, angle_error = read_errors(self.path, camera)
+        except (OSError, ValueError):
+            return None if errors else Surface(depth)
+        return Surface(depth, torch.from_numpy(depth_error)[None], torch.from_numpy(angle_error)[None])
+
+    def store(self, result: Result, seconds: Mapping[str, float], *, reused: bool = False) -> Stored:
+        """Write the parts of a result and ``info.json``, which says that it is not complete until the end.
+
+        Files of an earlier run with the same inputs and settings stay. ``seconds`` are those of the stages before; if
+        the depth of the earlier run is ``reused``, its stages count, too.
+        """
+        started, earlier = time.perf_counter(), self.earlier
+        kept = earlier if self.same else {}
+        depends_on = {"inputs": self.inputs, "settings": self.settings}
+        self._write_info({"complete": False, **depends_on, "files": list(earlier.get("files", ()))})
+        picture, surface = result.picture, result.surface
+        outputs = write_parts(self.path, result)
+        files = [name for output in outputs.values() for name in output.files]
+        facts = list(dict.fromkeys(note for output in outputs.values() for note in output.notes))
+        counts = {name: kept[name] for name, part in PARTS.items() if part.shape and name in kept.keys() - outputs}
+        for output in outputs.values():
+            of_shape = (name for name in outputs if set(PARTS[name].files) & set(output.files))
+            counts |= {} if output.shape is None else dict.fromkeys(of_shape, output.shape._asdict())
+        outliers = kept.get("outliers") if surface.outliers is None else surface.outliers._asdict()
+        if outliers is not None:
+            counts["outliers"] = outliers
+        others = [name for name in kept.get("files", ()) if name not in files]
+        notes = (*picture.assumptions, *facts)
+        known = ("warning: ", *(note.text for note in notes))
+        said = [each for each in (kept.get("assumptions", ()) if others else ()) if not each.startswith(known)]
+        seconds = {**seconds, "writing": time.perf_counter() - started}
+        before = earlier["seconds"] if reused else {}
+        together = {stage: before.get(stage, 0.0) + seconds.get(stage, 0.0) for stage in {**before, **seconds}}
+        shares = {name: round(share, 6) for name, share in result.shares.items()}
+        entries = {
+            **depends_on,
+            "method": result.plan.method,
+            "scale": result.plan.scale,
+            "plan": result.plan.text,
+            "noise": surface.noise._asdict() if surface.noise else kept.get("noise"),
+            **_described(picture, result.encoding),
+            **counts,
+            "shares": {**kept.get("shares", {}), **shares},
+            "assumptions": [*map(str, notes), *said],
+            "checks": CHECKS,
+            "warnings": [note.record() for note in notes if note.code],
+            "seconds": _with_total(together),
+            "versions": {"python": platform.python_version(), **package_versions(_PACKAGES)},
+        }
+        files += others
+        for name in earlier.get("files", ()):
+            if name not in files and name in FILES:
+                (self.path / name).unlink(missing_ok=True)
+        self._write_info({"complete": True, **entries, "files": files})
+        return Stored(facts, _with_total(seconds), bytes_of(self.path, files))
+
+    def _write_info(self, entries: Mapping[str, Any]) -> None:
+        write_text(self.path / INFO, json.dumps(entries, indent=2) + "\n")
 
 
-def _numbers(entries: Mapping[str, Any], name: str) -> dict[str, float]:
-    """Return the numbers of an entry of ``info.json`` by their names."""
-    return {key: float(value) for key, value in dict(entries.get(name, {})).items()}
+def _with_total(seconds: Mapping[str, float]) -> dict[str, float]:
+    """Return the seconds of stages, to milliseconds, with their sum as ``total``."""
+    found = {stage: round(each, 3) for stage, each in seconds.items() if stage != "total"}
+    return {**found, "total": round(sum(found.values()), 3)}
 
 
-def begin(folder: Path, settings: Mapping[str, Any], inputs: Mapping[str, Any], files: Sequence[str]) -> None:
-    """Mark a folder as that of an unfinished run."""
-    entries = {"complete": False, "inputs": inputs, "settings": settings, "files": files}
-    write_text(folder / INFO, json.dumps(entries, indent=2) + "\n")
-
-
-def finish(folder: Path, earlier: PreviousRun | None, entries: Mapping[str, Any], files: Sequence[str]) -> int:
-    """Write ``info.json`` of a finished run, remove other files of an earlier one, and return the size of the files."""
-    for name in () if earlier is None else earlier.files:
-        if name not in files and name in FILES:
-            (folder / name).unlink(missing_ok=True)
-    write_text(folder / INFO, json.dumps({"complete": True, **entries, "files": list(files)}, indent=2) + "\n")
-    return stored_bytes(folder, files)
-
-
-def stored_bytes(folder: Path, files: Iterable[str]) -> int:
-    """Return the size of ``info.json`` and of the files of a finished run that have not been removed since."""
+def bytes_of(folder: Path, files: Iterable[str]) -> int:
+    """Return the bytes of ``info.json`` and of those files that have not been removed since."""
     return sum((folder / name).stat().st_size for name in (*files, INFO) if (folder / name).is_file())
 
 
-def described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
+def _described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
     """Return the sizes, the camera with its pose, and the files' encodings for ``info.json``."""
+
+    def plain(encoding: Encoding) -> dict[str, Any]:
+        entries = asdict(encoding)
+        return entries if math.isfinite(encoding.hole) else {**entries, "hole": str(encoding.hole)}  # JSON has no NaN
+
     return {
         "photo_size": [picture.camera.width, picture.camera.height],
         "input_size": [picture.depth_lr.shape[-1], picture.depth_lr.shape[-2]],
@@ -202,13 +271,150 @@ def described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
         "pose": None if picture.pose is None else picture.pose.tolist(),
         "up": picture.up,
         "time": picture.time,
-        "input_depth": _plain(picture.encoding),
-        "depth_file": _plain(encoding),
-        "depth_metres": {"file": METRES, **_plain(IN_METRES)},
+        "input_depth": plain(picture.encoding),
+        "depth_file": plain(encoding),
+        "depth_metres": {"file": METRES, **plain(IN_METRES)},
     }
 
 
-def _plain(encoding: Encoding) -> dict[str, Any]:
-    """Return an encoding as values for JSON, which has no NaN."""
-    entries = asdict(encoding)
-    return entries if math.isfinite(encoding.hole) else {**entries, "hole": str(encoding.hole)}
+def as_stored(surface: Surface) -> Surface:
+    """Return a surface with expected errors that are stored to the bit, so that parts added later are the same."""
+
+    def rounded(values: Tensor | None) -> Tensor | None:
+        if values is None:
+            return None
+        mantissa, exponent = torch.frexp(values.float())
+        return torch.ldexp((_ERROR_STEPS * mantissa).round() / _ERROR_STEPS, exponent)
+
+    rough = surface._replace(depth_error=rounded(surface.depth_error), angle_error=rounded(surface.angle_error))
+    stored = {name: torch.from_numpy(values)[None].float() for name, values in rough.error_arrays().items()}
+    return surface._replace(depth_error=stored.get("depth_error"), angle_error=stored.get("angle_error"))
+
+
+def write_parts(folder: Path, result: Result) -> dict[str, Output]:
+    """Write the parts of a picture's result into its folder, and return what each has written, by name."""
+    names = [part.name for part in result.wanted.of_frame]
+    with ThreadPoolExecutor(1) as beside:  # shapes take as long as all the rest
+        shapes = {name: beside.submit(_WRITERS[name], folder, result) for name in names if PARTS[name].shape}
+        written = {name: _WRITERS[name](folder, result) for name in names if not PARTS[name].shape}
+        written |= {name: shape.result() for name, shape in shapes.items()}
+    return {name: Output(PARTS[name].files) if (output := written[name]) is None else output for name in names}
+
+
+def _depth(folder: Path, result: Result) -> Output:
+    """Write the depth in metres without loss, and in the output's encoding if that is another one."""
+    depth, encoding = result.surface.depth, result.encoding
+    write_depth_file(folder / METRES, depth[0].float().cpu().numpy())
+    if encoding is IN_METRES:
+        return Output((METRES,))
+    values, lost = encode(depth, encoding, result.picture.camera)
+    name = f"depth{encoding.suffix}"
+    notes = []
+    if lost:
+        text = f"{name}: what {encoding.dtype} values of this unit cannot hold is written as a hole; {METRES} has all"
+        notes.append(Assumption(text, f"{lost} pixels"))
+    write_depth_file(folder / name, values)
+    if np.dtype(encoding.dtype).kind in "iu":
+        notes.append(Assumption(f"{name} is in whole numbers like the input; {METRES} is not rounded"))
+    return Output((name, METRES), notes)
+
+
+def _renderings(folder: Path, result: Result) -> None:
+    write_renderings(folder / "renderings", result.surface.depth, result.picture.camera)
+
+
+def _normals(folder: Path, result: Result) -> None:
+    write_normals(folder / "normals.png", result.surface.depth, result.picture.camera)
+
+
+def _cloud(folder: Path, result: Result) -> Output:
+    depth, notes = result.certain
+    if depth is None:
+        return Output((), notes)
+    picture, most, filled = result.picture, result.wanted.max_points, result.surface.filled
+    shape = write_cloud(folder / "cloud.ply", picture.rgb, depth, picture.camera, most=most, filled=filled)
+    return Output(("cloud.ply",), (*notes, *_fewer("cloud", "points", "--max-points", shape)), shape)
+
+
+def _mesh(folder: Path, result: Result) -> Output:
+    """Write the meshes that are asked for."""
+    depth, notes = result.certain
+    if depth is None:
+        return Output((), notes)
+    picture, wanted, filled = result.picture, result.wanted, result.surface.filled
+    files = [PARTS[name].files[0] for name in ("mesh", "mesh_ply") if name in wanted.names]
+    tolerance = None
+    if wanted.keep != "all":
+        tolerance = FLATNESS * depth
+        if (error := result.surface.depth_error) is not None:
+            tolerance = tolerance.maximum(ERROR_SHARE * error)
+    paths = [folder / name for name in files]
+    try:
+        shape = write_mesh(
+            paths, picture.rgb, depth, picture.camera, most=wanted.max_faces, tolerance=tolerance, filled=filled
+        )
+    except ValueError as error:
+        return Output((), (*notes, Assumption("no mesh", str(error))))
+    return Output(files, (*notes, *_fewer("mesh", "triangles", "--max-faces", shape)), shape)
+
+
+def _mesh_ply(folder: Path, result: Result) -> Output:
+    return Output(()) if "mesh" in result.wanted.names else _mesh(folder, result)
+
+
+def _fewer(part: str, what: str, option: str, shape: Written) -> list[Assumption]:
+    """Return a note on a shape that a limit has made smaller."""
+    text = f"the {part} has fewer {what} than the depth map gives ({option})"
+    return [Assumption(text, str(shape))] if shape.how not in ("", FLAT) else []
+
+
+def _before_after(folder: Path, result: Result) -> None:
+    from dsr.pictures.before_after import write_before_after  # noqa: PLC0415 - Matplotlib, which takes a second
+
+    picture, plan = result.picture, result.plan
+    title = ", ".join(filter(None, (result.name, f"{plan.method} x{plan.scale}")))
+    path = folder / "before_after.png"
+    write_before_after(path, picture.rgb, picture.depth_lr, result.surface.depth, picture.camera, title)
+
+
+def _confidence(folder: Path, result: Result) -> Output | None:
+    from dsr.pictures.expected_errors import write_confidence  # noqa: PLC0415 - as above
+
+    surface = result.surface
+    if surface.depth_error is None or surface.angle_error is None:
+        return Output(())
+    write_confidence(folder / "confidence.png", surface.depth, surface.depth_error, surface.angle_error)
+    with replacing(folder / ERRORS) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **surface.error_arrays())
+    return None
+
+
+def _filled(folder: Path, result: Result) -> Output | None:
+    if result.surface.filled is None:
+        return Output(())
+    write_mask(folder / "filled.png", result.surface.filled)
+    return None
+
+
+def _input(folder: Path, result: Result) -> None:
+    write_input(folder / INPUT, result.picture.rgb, result.picture.depth_lr)
+
+
+def _rgbd(folder: Path, result: Result) -> Output:
+    notes = write_rgbd(folder / "rgbd", result.picture.rgb, result.surface.depth, result.picture.camera)
+    return Output([f"rgbd/{name}" for name in RGBD], notes)
+
+
+_WRITERS: Mapping[str, Callable[[Path, Result], Output | None]] = {
+    "depth": _depth,
+    "renderings": _renderings,
+    "normals": _normals,
+    "mesh": _mesh,
+    "before_after": _before_after,
+    "confidence": _confidence,
+    "filled": _filled,
+    "input": _input,
+    "mesh_ply": _mesh_ply,
+    "cloud": _cloud,
+    "rgbd": _rgbd,
+}

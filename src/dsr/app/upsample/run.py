@@ -5,46 +5,74 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
+import os
 import time
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
+from dsr.app.upsample.frame import Done, FrameWork, Message, Tell
 from dsr.app.upsample.frames import Frames, find_frames
-from dsr.app.upsample.outputs import INFO
-from dsr.app.upsample.reporting import Reporter, listed
 from dsr.app.upsample.request import UpsampleRequest
-from dsr.app.upsample.stored import EXPORTS, read_info, write_scene
-from dsr.app.upsample.workers import preview, work_through
+from dsr.app.upsample.stored import EXPORTS, read_complete, write_scene
 from dsr.io.images import pixels_in_header
 from dsr.io.inputs import read_geometry
 from dsr.io.pairs import Pair
 from dsr.io.reading import Shard
 from dsr.io.scene_files import expect_poses
 from dsr.io.trajectories import USUAL_SIZE, read_poses
+from dsr.notes import Assumption
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import expect_targets, write_text
-from dsr.utils.processes import at_work
-from dsr.utils.progress import clock, megabytes
+from dsr.utils.processes import Pool, at_work
+from dsr.utils.progress import Progress, clock, megabytes
 
-_UNPOSED = {
+_UNPOSED = {  # what is written of a single frame without a pose, by part
     "gaussian": ": images, depths and depth_params.json are written, and no sparse model; --poses gives one",
     "nerfstudio": ": it stands at the origin",
 }
-"""What is written of a single frame without a pose, by part."""
 _READ_ONLY = (errno.EACCES, errno.EPERM, errno.EROFS)
+_SHOWN = 5  # number of names that a line lists; further ones are only counted
+_work: FrameWork | None = None  # of this process, if it is a worker
+
+
+class Reporter:
+    """Shows every note once, and counts the pictures that it applies to."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._counts: Counter[str] = Counter()
+        self._warned: dict[str, Assumption] = {}
+
+    def tell(self, message: Message) -> None:
+        """Show a line, or the notes that no earlier picture had."""
+        if isinstance(message, str):
+            show(self._console, message)
+            return
+        for note in message:
+            if not self._counts[note.statement]:
+                show(self._console, f"  {note}")
+            self._counts[note.statement] += 1
+            if note.code:
+                self._warned.setdefault(note.statement, note)
+
+    @property
+    def warnings(self) -> list[dict[str, Any]]:
+        """The warnings as values for JSON, each once, as of the first of so many ``pictures``."""
+        return [{**note.record(), "pictures": self._counts[text]} for text, note in self._warned.items()]
+
+    def summary(self, pictures: int) -> None:
+        """Show the notes that apply to some of the pictures only."""
+        for text, count in self._counts.items():
+            if count < pictures:
+                show(self._console, f"  {count} of {pictures} pictures: {text}")
 
 
 def run(request: UpsampleRequest, console: Console) -> list[str]:
-    """Upsample all pictures of a request.
-
-    Args:
-        request: the request.
-        console: where progress and assumptions are shown.
-
-    Returns:
-        The problems, one line each; empty if there were none.
+    """Upsample all pictures of a request, and return the problems, one line each.
 
     Raises:
         ValueError: the pairs cannot be determined, frames lack poses that a part needs, a file would be written outside
@@ -69,64 +97,41 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
         return _run(request, frames, console)
 
 
-def _posed(request: UpsampleRequest, frames: Frames) -> dict[str, bool]:
-    """Return whether each frame has a pose, of the file, of its capture or of its result; frames that fail count."""
-    if request.frames.trajectory is not None:
-        given = read_poses(request.frames.trajectory).assign(frames.whole)
-        return {pair.name: pair.name in given for pair in frames.whole}
-
-    def posed(pair: Pair) -> bool:
-        info = frames.target(request.results.output, pair) / INFO
-        try:
-            geometry, _ = read_geometry(pair, pixels_in_header(pair.rgb) or USUAL_SIZE, request.reading)
-        except (ValueError, OSError):
-            return True
-        if geometry.pose is not None:
-            return True
-        try:
-            return read_info(info).get("pose") is not None
-        except (ValueError, OSError):
-            return False
-
-    return {pair.name: posed(pair) for pair in frames.whole}
-
-
 def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str]:
     """Upsample frames, and return the problems."""
-    wanted, shard = request.results, request.frames.shard
+    wanted, shard, pairs = request.results, request.frames.shard, frames.found.pairs
     started = time.monotonic()
-    of_all = [] if shard is not None else [*(name for part in wanted.of_all for name in part.files), EXPORTS]
+    of_all = [*(name for part in wanted.of_all for name in part.files), EXPORTS]
     expect_targets(wanted.output, of_all if shard is None else [_summary_of(shard)])
-    _show_found(console, request, frames)
-    found, single = frames.found, frames.single
-    reporter, progress = Reporter(console), ConsoleProgress(console)
-    problems: dict[str, list[str]] = {}
+    for line in _found(request, frames):
+        show(console, line)
+    reporter = Reporter(console)
     outcomes: Counter[str] = Counter()
+    problems: dict[str, list[str]] = {}
     targets: dict[str, Path] = {}
-    size = 0.0
-    scene_problems: list[str] = []
-    through = preview if wanted.dry_run else work_through
-    for done in through(request, frames, reporter, progress):
+    size = 0
+    for done in work_through(request, frames, reporter.tell, ConsoleProgress(console)):
         if done.problem is None:
             outcomes[done.outcome] += 1
             targets[done.pair.name] = done.target
-            size += done.bytes
+            size += done.size
         else:
             problems.setdefault(done.problem, []).append(done.pair.name)
+    lines = [f"{_listed(names)}: {message}" if len(pairs) > 1 else message for message, names in problems.items()]
     if targets and wanted.of_all and not wanted.dry_run and shard is None:
         scene = write_scene(wanted.output, targets, wanted.of_all, overwrite=wanted.overwrite)
         for part, path in scene.files.items():
-            reporter.say(f"{part}: {len(targets)} frames -> {path}")
-        scene_problems = scene.problems
-    if not single:
-        if not wanted.dry_run:
-            reporter.summary(outcomes.total())
+            show(console, f"{part}: {len(targets)} frames -> {path}")
+        lines += scene.problems
+    if not frames.single:
         counts = [f"{count} {outcome}" for outcome, count in outcomes.items()]
         counts += [f"{sum(map(len, problems.values()))} failed"] if problems else []
-        counts = counts or ["nothing to do"]
-        pictures = "1 picture" if len(found.pairs) == 1 else f"{len(found.pairs)} pictures"
-        took = "" if wanted.dry_run else f" in {clock(time.monotonic() - started)}, {megabytes(size)}"
-        show(console, f"{pictures}: {', '.join(counts)}{took} -> {wanted.output}")
+        took = ""
+        if not wanted.dry_run:
+            reporter.summary(outcomes.total())
+            took = f" in {clock(time.monotonic() - started)}, {megabytes(size)}"
+        pictures = "1 picture" if len(pairs) == 1 else f"{len(pairs)} pictures"
+        show(console, f"{pictures}: {', '.join(counts) or 'nothing to do'}{took} -> {wanted.output}")
     if shard is not None and not wanted.dry_run:
         summary = {
             "shard": str(shard),
@@ -136,8 +141,69 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
             "seconds": round(time.monotonic() - started, 3),
         }
         write_text(wanted.output / _summary_of(shard), json.dumps(summary, indent=2) + "\n")
-    lines = [f"{listed(names)}: {message}" if len(found.pairs) > 1 else message for message, names in problems.items()]
-    return lines + scene_problems
+    return lines
+
+
+def work_through(request: UpsampleRequest, frames: Frames, tell: Tell, progress: Progress) -> Iterator[Done]:
+    """Upsample pictures in ``--workers`` processes, each with its share of the cores; yield each once it is done.
+
+    Notes are shown in the order of the pictures, or as they come from several workers.
+    """
+    jobs = [(pair, frames.target(request.results.output, pair)) for pair in frames.found.pairs]
+    workers = min(request.frames.workers, len(jobs))
+    work = FrameWork(request, frames)  # raises for poses that do not fit
+    frames = work.check_together(jobs)
+    if workers <= 1:
+        for job in progress.track(jobs, "upsample", label=lambda job: job[0].name, lines=False):
+            yield work(*job, tell, progress)
+        return
+    left, threads = list(jobs), max(1, (os.cpu_count() or 1) // workers)
+    with Pool(workers, _begin, (request, frames), threads, progress.say) as pool:
+        results = pool.results(_remote, jobs)
+        try:
+            for job, (done, messages) in progress.track(
+                results, "upsample", len(jobs), label=lambda each: each[0][0].name
+            ):
+                left.remove(job)
+                for message in messages:
+                    tell(message)
+                yield done
+        except ChildProcessError as error:
+            yield from (Done(*job, problem=str(error)) for job in left)
+
+
+def _begin(request: UpsampleRequest, frames: Frames) -> None:
+    """Prepare a worker."""
+    global _work  # noqa: PLW0603 - the process's own
+    _work = FrameWork(request, frames)
+
+
+def _remote(job: tuple[Pair, Path]) -> tuple[Done, list[Message]]:
+    """Upsample a picture in a worker, and return what is to be told of it, too."""
+    assert _work is not None  # noqa: S101 - workers begin with _begin
+    messages: list[Message] = []
+    return _work(*job, messages.append, Progress()), messages
+
+
+def _posed(request: UpsampleRequest, frames: Frames) -> dict[str, bool]:
+    """Return whether each frame has a pose, of the file, of its capture or of its result; frames that fail count."""
+    if request.frames.trajectory is not None:
+        given = read_poses(request.frames.trajectory).assign(frames.whole)
+        return {pair.name: pair.name in given for pair in frames.whole}
+
+    def posed(pair: Pair) -> bool:
+        try:
+            geometry, _ = read_geometry(pair, pixels_in_header(pair.rgb) or USUAL_SIZE, request.reading)
+        except (ValueError, OSError):
+            return True
+        if geometry.pose is not None:
+            return True
+        try:
+            return read_complete(frames.target(request.results.output, pair)).get("pose") is not None
+        except (ValueError, OSError):
+            return False
+
+    return {pair.name: posed(pair) for pair in frames.whole}
 
 
 def _summary_of(shard: Shard) -> str:
@@ -145,22 +211,24 @@ def _summary_of(shard: Shard) -> str:
     return f"shard-{shard.number}-of-{shard.count}.json"
 
 
-def _show_found(console: Console, request: UpsampleRequest, frames: Frames) -> None:
-    """Show what was found, which files have no partner, and which frames a shard works on."""
+def _found(request: UpsampleRequest, frames: Frames) -> Iterator[str]:
+    """Yield lines on what was found, which files have no partner, and which frames a shard works on."""
     found, total, shard = frames.found, len(frames.whole), request.frames.shard
     named = total == 1 and len(found.pairs) == 1
-    lines = [f"{found.pairs[0].rgb} and {found.pairs[0].depth}" if named else f"{total} pairs of photo and depth map"]
-    lines += [f"  {fact}" for fact in found.assumptions]
+    yield f"{found.pairs[0].rgb} and {found.pairs[0].depth}" if named else f"{total} pairs of photo and depth map"
+    yield from (f"  {fact}" for fact in found.assumptions)
     if found.unpaired:
-        lines.append(
-            f"  {len(found.unpaired)} without a partner, left out: {listed([path.name for path in found.unpaired])}"
-        )
+        names = _listed([path.name for path in found.unpaired])
+        yield f"  {len(found.unpaired)} without a partner, left out: {names}"
     if shard is not None:
         block = shard.block(total)
-        which = f"frames {block.start + 1} to {block.stop}" if block else "no frame"
-        lines.append(f"shard {shard}: {which} of {total}")
+        yield f"shard {shard}: {f'frames {block.start + 1} to {block.stop}' if block else 'no frame'} of {total}"
         if request.results.of_all:
             names = ", ".join(part.name for part in request.results.of_all)
-            lines.append(f"  {names}: of all frames, by the same command without --shard")
-    for line in lines:
-        show(console, line)
+            yield f"  {names}: of all frames, by the same command without --shard"
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return the first names, and how many more there are."""
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more

@@ -19,21 +19,9 @@ from dsr.notes import LIMITS, Assumption
 
 
 class FrameSequence:
-    """The frames of a folder in order, with their poses.
+    """The frames of each folder of depth maps in order, with the poses of a file, or those that the frames have.
 
-    Args:
-        pairs: the frames.
-        read: reads one of them.
-        neighbours: number of frames that vote on each frame's depth beside itself.
-        poses: file of poses; None for those that the frames themselves have.
-
-    Attributes:
-        recordings: the frames of each folder of depth maps.
-        given: whether the poses are those of a file.
-
-    Raises:
-        ValueError: the file is damaged, or does not fit the frames.
-
+    A number of neighbours votes on each frame's depth. A file that is damaged, or does not fit, is a ValueError.
     """
 
     def __init__(
@@ -53,8 +41,8 @@ class FrameSequence:
         self.recordings: dict[Path, list[Pair]] = {}
         for pair in pairs:
             self.recordings.setdefault(pair.depth.parent, []).append(pair)
+        self._views: OrderedDict[str, View | None] = OrderedDict()
         self._places = {pair.name: place for folder in self.recordings.values() for place, pair in enumerate(folder)}
-        self._kept: OrderedDict[str, View | None] = OrderedDict()
 
     def neighbours(self, pair: Pair) -> list[Pair]:
         """Return the neighbours of a frame, the nearest first; those of its own folder that have a pose."""
@@ -66,12 +54,7 @@ class FrameSequence:
         return [folder[number] for number in found]
 
     def with_pose(self, pair: Pair, picture: Picture) -> Picture:
-        """Return a frame with its pose from the file, if there is one.
-
-        Raises:
-            ValueError: neighbours are to vote, and the frame has no pose.
-
-        """
+        """Return a frame with its pose from the file, if any; a ValueError if neighbours vote and it has no pose."""
         notes = list(self._matched)
         if self._poses is not None:
             picture = replace(picture, pose=self._poses.get(pair.name), up="")
@@ -115,27 +98,19 @@ class FrameSequence:
         return vote(picture, views, len(others), failed)
 
     def _view(self, pair: Pair) -> View | None:
-        """Return what a neighbour contributes, nothing without a pose; the latest ones are kept."""
-        if pair.name not in self._kept:
+        """Return what a neighbour contributes, nothing without a pose; the latest ones are kept with their noise."""
+        if pair.name not in self._views:
             picture = self._read(pair)
             pose = picture.pose if self._poses is None else self._poses.get(pair.name)
-            self._kept[pair.name] = None if pose is None else View(picture.depth_lr, camera_lr(picture), pose)
-            while len(self._kept) > self._count + 2:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(pair.name)
-        return self._kept[pair.name]
+            self._views[pair.name] = None if pose is None else View(picture.depth_lr, camera_lr(picture), pose)
+            if len(self._views) > self._count + 2:
+                self._views.popitem(last=False)
+        self._views.move_to_end(pair.name)
+        return self._views[pair.name]
 
 
 def nearest(place: int, total: int, count: int, usable: Callable[[int], bool]) -> list[int]:
-    """Return the places of the frames that vote on one, the nearest first.
-
-    Args:
-        place: of the frame.
-        total: number of frames.
-        count: of those that vote, at most.
-        usable: whether a frame may.
-
-    """
+    """Return the places, of ``total``, of at most ``count`` usable frames that vote on one, the nearest first."""
     found: list[int] = []
     for distance in range(1, total):
         found += [other for other in (place - distance, place + distance) if 0 <= other < total and usable(other)]
@@ -145,14 +120,7 @@ def nearest(place: int, total: int, count: int, usable: Callable[[int], bool]) -
 
 
 def vote(picture: Picture, views: Sequence[View], count: int, failed: int = 0) -> Picture:
-    """Return a frame with a pose, its depth fused with that of its neighbours.
-
-    Args:
-        views: the neighbours.
-        count: how many there are, with those that could not be read.
-        failed: how many of them could not be read.
-
-    """
+    """Return a frame with a pose, its depth fused with its neighbours'; ``failed`` of ``count`` could not be read."""
     assert picture.pose is not None  # noqa: S101 - see above
     fused = fuse_views(View(picture.depth_lr, camera_lr(picture), picture.pose), views)
     known = picture.depth_lr.isfinite()

@@ -6,14 +6,12 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 
-from dsr.app.upsample.outputs import INFO
 from dsr.app.upsample.parts import ERRORS, METRES, Part, Results
 from dsr.evaluation.results import load_errors
 from dsr.geometry.camera import Camera
@@ -21,7 +19,9 @@ from dsr.inference import find_filled
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import INPUT, read_input
 from dsr.io.frames import UPS
-from dsr.io.scene_files import RGBD, Frame, parse_pose
+from dsr.io.open3d import write_open3d
+from dsr.io.scene_files import RGBD, Frame, parse_pose, write_rerun, write_splatting, write_transforms
+from dsr.notes import Assumption, read_warning
 from dsr.sample import expect_distances
 from dsr.utils.arrays import array_headers
 from dsr.utils.files import write_text
@@ -31,20 +31,22 @@ from dsr.utils.progress import show_length
 if TYPE_CHECKING:
     from dsr.report.surface_page import ViewedResult
 
-_DEEPEST = 6
-"""Folders below the given one in which results are looked for."""
-_LARGEST_INFO = 16 << 20
-EXPORTS = "exports.json"
-"""The record of exports, in the folder of the results."""
+INFO = "info.json"
+EXPORTS = "exports.json"  # the record of exports, in the folder of the results
+_OPTIONAL: Mapping[str, Any] = {  # entries of ``info.json`` that a run that is not complete has not
+    "noise": None,
+    "shares": {},
+    "seconds": {},
+    "assumptions": [],
+    "warnings": [],
+    "photo_size": [],
+    "input_size": [],
+}
+_DEEPEST = 6  # folders below the given one in which results are looked for
 
 
 def find_results(folder: Path) -> list[Path]:
-    """Return the folders of results at and below a folder, in the order of their names, numbers by value.
-
-    Raises:
-        ValueError: there is none.
-
-    """
+    """Return the folders of results at and below a folder, in the order of their names; a ValueError for none."""
     if not folder.is_dir():
         raise ValueError(f"{folder}: expected the folder of a result of `dsr upsample`, there is no such folder")
     found = []
@@ -59,63 +61,71 @@ def find_results(folder: Path) -> list[Path]:
 
 
 def read_result(folder: Path, name: str) -> ViewedResult:
-    """Read a result.
-
-    Args:
-        folder: that of the result.
-        name: its name on the page.
-
-    Raises:
-        ValueError: the folder holds no complete result, or a file is damaged.
-
-    """
+    """Read a result for a page on which it has a name; a ValueError if it is not complete, or a file is damaged."""
     from dsr.report.surface_page import ViewedResult  # noqa: PLC0415 - pages need Matplotlib
 
-    info = read_info(folder / INFO)
-    camera = read_camera(folder / INFO, info)
-    depth = read_depth(folder, camera)
-    said = info.get("assumptions")
-    notes = [str(text) for text in said] if isinstance(said, list) else []
-    errors: tuple[np.ndarray, np.ndarray] | None = None
+    info = read_complete(folder)
+    camera = read_camera(folder, info)
+    depth, notes = read_depth(folder, camera), list(info["assumptions"])
+    depth_error = angle_error = None
     if (folder / ERRORS).is_file():
-        errors = read_errors(folder / ERRORS, camera)
-    photo = depth_lr = None
+        depth_error, angle_error = read_errors(folder, camera)
+    photo = depth_lr = filled = None
     try:
         photo, depth_lr = read_input(folder / INPUT)
+        filled = find_filled(*(torch.from_numpy(each)[None] for each in (depth, depth_lr)))[0].numpy()
     except FileNotFoundError:
         notes.append(f"without {INPUT} there is neither the photo nor the input; the same `dsr upsample` again adds it")
-    settings = info.get("settings")
-    limit = settings.get("max_error") if isinstance(settings, dict) else None
-    filled = None if depth_lr is None else find_filled(*(torch.from_numpy(each)[None] for each in (depth, depth_lr)))
+    limit = info["settings"].get("max_error")
     return ViewedResult(
         name=name,
         depth=depth,
         camera=camera,
         photo=photo,
         depth_lr=depth_lr,
-        depth_error=None if errors is None else errors[0],
-        angle_error=None if errors is None else errors[1],
-        filled=None if filled is None else filled[0].numpy(),
+        depth_error=depth_error,
+        angle_error=angle_error,
+        filled=filled,
         max_error=float(limit) if is_number(limit) and 0 < limit < 1e9 else Results.max_error / 100,
         facts=_facts(info, depth),
         notes=notes,
     )
 
 
-def read_info(path: Path) -> Mapping[str, Any]:
-    """Read ``info.json`` of a complete result.
-
-    Raises:
-        ValueError: it is damaged or foreign, or the run was interrupted.
-
-    """
+def read_info(folder: Path) -> dict[str, Any] | None:
+    """Return the ``info.json`` of a run, complete or not; None if there is none, a ValueError if it is not ours."""
+    path = folder / INFO
+    if not path.is_file():
+        return None
     try:
-        info = parse_json(read_limited(path, _LARGEST_INFO), finite=False)
-        complete, _ = info["complete"], info["files"]
-    except (ValueError, KeyError, TypeError) as error:
+        info = {**_OPTIONAL, **parse_json(read_limited(path), finite=False)}
+        lists = [info[name] for name in ("files", "assumptions", "warnings", "photo_size", "input_size")]
+        records = [info[name] for name in ("inputs", "settings", "shares", "seconds")]
+        records += [*info["inputs"].values(), *([] if info["noise"] is None else [info["noise"]])]
+        if not all(isinstance(each, list) for each in lists) or not all(isinstance(each, dict) for each in records):
+            raise TypeError
+        if not all(isinstance(text, str) for text in (*info["files"], *info["assumptions"])):
+            raise TypeError
+        if not all(map(is_number, (*info["shares"].values(), *info["seconds"].values()))):
+            raise TypeError
+        warnings_of(info)
+        return {**info, "complete": info["complete"] is True}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else") from error
-    if complete is not True:
-        raise ValueError(f"{path}: expected a complete result, got that of an interrupted run; run it again")
+
+
+def warnings_of(info: Mapping[str, Any]) -> tuple[Assumption, ...]:
+    """Return the warnings that a run gave."""
+    return tuple(read_warning(each) for each in info["warnings"])
+
+
+def read_complete(folder: Path) -> dict[str, Any]:
+    """Return the ``info.json`` of a complete result; a ValueError if there is none."""
+    info = read_info(folder)
+    if info is None:
+        raise ValueError(f"{folder}: expected a result of `dsr upsample`, got a folder without {INFO}")
+    if not info["complete"]:
+        raise ValueError(f"{folder / INFO}: expected a complete result, got that of an interrupted run; run it again")
     return info
 
 
@@ -125,31 +135,17 @@ def read_up(info: Mapping[str, Any]) -> str:
     return up if isinstance(up, str) and up in UPS else ""
 
 
-def read_camera(path: Path, info: Mapping[str, Any]) -> Camera:
-    """Return the camera of the photo.
-
-    Args:
-        path: ``info.json``, named in an error.
-        info: its entries.
-
-    Raises:
-        ValueError: they hold no camera.
-
-    """
+def read_camera(folder: Path, info: Mapping[str, Any]) -> Camera:
+    """Return the camera of the photo of a result; a ValueError if its ``info.json`` has none."""
     try:
         return Camera(**info["camera"])
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         came = f"{info.get('camera')!r:.200}"
-        raise ValueError(f"{path}: expected the photo's camera under `camera`, got {came}") from error
+        raise ValueError(f"{folder / INFO}: expected the photo's camera under `camera`, got {came}") from error
 
 
 def read_depth(folder: Path, camera: Camera) -> np.ndarray:
-    """Return the depth of a result, (H, W) float32 in metres, NaN in holes.
-
-    Raises:
-        ValueError: the file is missing, damaged or foreign, or has no depth.
-
-    """
+    """Return the depth of a result, (H, W) float32 in metres, NaN in holes; a ValueError if there is none."""
     path, size = folder / METRES, (camera.height, camera.width)
     if not path.is_file():
         raise ValueError(f"{folder}: expected a result with depth, got one without {METRES}; run it with --only depth")
@@ -171,13 +167,12 @@ def read_depth(folder: Path, camera: Camera) -> np.ndarray:
     return depth
 
 
-def read_errors(path: Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return the expected errors of depth and normal, (H, W) float32 each, in metres and degrees.
+def read_errors(folder: Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return the expected errors of depth and normal of a result, (H, W) float32 each, in metres and degrees.
 
-    Raises:
-        ValueError: the file is damaged or foreign.
-
+    A damaged or foreign file is a ValueError, a missing one an OSError.
     """
+    path = folder / ERRORS
     size = (camera.height, camera.width)
     shapes = {name: shape for name, (shape, _) in array_headers(path).items()}
     if any(shapes.get(name) != size for name in ("depth_error", "angle_error")):
@@ -192,108 +187,88 @@ def _facts(info: Mapping[str, Any], depth: np.ndarray) -> dict[str, str]:
     """Return what is written below the surface."""
     known = depth[np.isfinite(depth)]
     near, middle, far = np.percentile(known, (1, 50, 99))
+    photo, given = (" x ".join(map(str, info[name])) or "unknown" for name in ("photo_size", "input_size"))
     facts = {
         "method": f"{info.get('method', 'unknown')} x{info.get('scale', '?')}",
-        "photo": _size(info.get("photo_size")),
-        "input": _size(info.get("input_size")),
+        "photo": photo,
+        "input": given,
         "depth": f"{near:.2f} to {far:.2f} m, median {middle:.2f} m",
     }
-    noise = info.get("noise")
-    if isinstance(noise, dict) and is_number(noise.get("deviation")):
+    noise = info["noise"]
+    if noise is not None and is_number(noise.get("deviation")):
         facts["noise of the input"] = f"about {show_length(noise['deviation'], 2)}"
     return facts
 
 
-def _size(size: Any) -> str:
-    """Return a size as text."""
-    return f"{size[0]} x {size[1]}" if isinstance(size, list) and len(size) == 2 else "unknown"
+def read_frame(name: str, folder: Path) -> Frame:
+    """Return the frame whose results are in a folder; a ValueError if they are not complete.
+
+    Its pose is the entry ``pose`` of ``info.json``: a camera-to-world matrix of four lists of four numbers, in metres.
+    """
+    info = read_complete(folder)
+    depth, colour = folder / METRES, folder / "rgbd" / RGBD[0]
+    if not (depth.is_file() and colour.is_file()):
+        raise ValueError(f"{folder}: expected {METRES} and rgbd/{RGBD[0]} of this run, one is missing")
+    pose, time = parse_pose(f"{folder / INFO}: pose", info.get("pose")), info.get("time")
+    return Frame(name, read_camera(folder, info), pose, colour, depth, read_up(info), time if is_number(time) else None)
 
 
-@dataclass
-class SceneResult:
+class SceneResult(NamedTuple):
     """What was written, by part, and the problems, one line each."""
 
-    files: dict[str, Path] = field(default_factory=dict)
-    problems: list[str] = field(default_factory=list)
+    files: dict[str, Path]
+    problems: list[str]
 
 
 def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[Part], *, overwrite: bool) -> SceneResult:
     """Write exports of frames that are complete, and record them in ``exports.json``.
 
-    A problem with one export does not stop the others.
-
-    Args:
-        output: the folder of the results.
-        folders: the folder of each frame, by its name.
-        parts: parts of all frames together.
-        overwrite: whether to replace what is there and not recorded.
-
+    A problem with one export does not stop the others. ``folders`` are those of the frames, by their names; with
+    ``overwrite`` what is there and not recorded is replaced.
     """
-    result = SceneResult()
+    result = SceneResult({}, [])
     try:
         frames = [read_frame(name, folder) for name, folder in folders.items()]
-        expect_distinct(frames)
-        recorded = _read_record(output)
+        names: dict[str, str] = {}
+        for frame in frames:
+            if frame.stem in names:
+                other = names[frame.stem]
+                raise ValueError(f"expected frames of different names as files, got {other} and {frame.name}")
+            names[frame.stem] = frame.name
+        recorded = read_exports(output)
     except (ValueError, OSError) as error:
         result.problems.append(str(error))
         return result
     for part in parts:
-        assert part.write_all is not None  # noqa: S101 - they are of all frames
         name = part.files[0]
-        path = output / name
         there = [output / each for each in part.files if (output / each).exists()]
         if there and name not in recorded and not overwrite:
             result.problems.append(f"{there[0]}: is there already and not of an earlier run; --overwrite replaces it")
             continue
         try:
-            files = part.write_all(path, frames)
+            paths = _EXPORTERS[part.name](output / name, frames)
         except (ValueError, OSError) as error:
             result.problems.append(str(error))
             continue
-        stale = set(recorded.get(name, ())) - {file.relative_to(output).as_posix() for file in files}
-        for old in stale:  # of frames that are no longer there
+        files = sorted(path.relative_to(output).as_posix() for path in paths)
+        for old in set(recorded.get(name, ())) - set(files):  # of frames that are no longer there
             if old.split("/")[0] in part.files:
                 (output / old).unlink(missing_ok=True)
-        recorded[name] = sorted(file.relative_to(output).as_posix() for file in files)
+        recorded[name] = files
         write_text(output / EXPORTS, json.dumps({"exports": recorded}, indent=2) + "\n")
-        result.files[part.name] = path
+        result.files[part.name] = output / name
     return result
 
 
-def read_frame(name: str, folder: Path) -> Frame:
-    """Return the frame whose results are in a folder.
-
-    Its pose is the entry ``pose`` of ``info.json``: a camera-to-world matrix of four lists of four numbers, in metres.
-
-    Raises:
-        ValueError: the folder is not complete, or the pose is none.
-
-    """
-    path = folder / INFO
-    info = read_info(path)
-    depth, colour = folder / METRES, folder / "rgbd" / RGBD[0]
-    if not (depth.is_file() and colour.is_file()):
-        raise ValueError(f"{folder}: expected {METRES} and rgbd/{RGBD[0]} of this run, one is missing")
-    pose, time = parse_pose(f"{path}: pose", info.get("pose")), info.get("time")
-    time = time if is_number(time) else None
-    return Frame(name, read_camera(path, info), pose, colour, depth, read_up(info), time)
+_EXPORTERS = {
+    "open3d": write_open3d,
+    "nerfstudio": write_transforms,
+    "gaussian": write_splatting,
+    "rerun": write_rerun,
+}
 
 
-def expect_distinct(frames: Sequence[Frame]) -> None:
-    """Check that frames have different names as files.
-
-    Raises:
-        ValueError: two have the same.
-
-    """
-    seen: dict[str, str] = {}
-    for frame in frames:
-        if frame.stem in seen:
-            raise ValueError(f"expected frames of different names as files, got {seen[frame.stem]} and {frame.name}")
-        seen[frame.stem] = frame.name
-
-
-def _read_record(output: Path) -> dict[str, list[str]]:
+def read_exports(output: Path) -> dict[str, list[str]]:
     """Return the exports of earlier runs, with their files."""
     path = output / EXPORTS
     if not path.is_file():

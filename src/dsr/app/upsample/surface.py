@@ -16,10 +16,9 @@ import torch
 import trimesh
 from torch import Tensor
 
-from dsr.app.upsample.frame import Times, write_result
-from dsr.app.upsample.outputs import begin, expect_free, output_encoding, read_previous_run
-from dsr.app.upsample.parts import Result, Results
-from dsr.app.upsample.stored import write_scene
+from dsr.app.upsample.outputs import Result, ResultFolder
+from dsr.app.upsample.parts import Results
+from dsr.app.upsample.stored import read_complete, write_scene
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import FIGURE_LIGHT, Direction, direction_of
 from dsr.geometry.mesh import Mesh, triangulate, vertex_normals
@@ -33,7 +32,6 @@ from dsr.methods import base
 from dsr.methods.base import MapNoise, Outliers
 from dsr.notes import warn
 from dsr.pictures.canvas import encode_row
-from dsr.utils.progress import SILENT
 
 Array = TypeVar("Array", np.ndarray, Tensor)
 _OPTIONS = ("format", "max_error", "certain", "max_faces", "max_points", "keep", "overwrite")
@@ -209,30 +207,20 @@ class Surface(Generic[Array]):
             return self._save(Results(output=Path(folder), only=only, **options))
 
     def _save(self, wanted: Results) -> list[Path]:
-        """Write results."""
-        folder = wanted.output
-        earlier = read_previous_run(folder)
+        """Write results, and return the files."""
         content = hashlib.sha256(self._found.depth.numpy().tobytes() + _bytes(self._picture.rgb).tobytes())
         inputs = {"surface": {"sha256": content.hexdigest()}}  # which a folder of results has for its inputs
-        settings = {"max_error": wanted.max_error / 100}
-        same = earlier is not None and earlier.complete and (earlier.inputs, earlier.settings) == (inputs, settings)
-        if earlier is not None and not same and not wanted.overwrite:
-            raise ValueError(f"{folder}: holds another result; take another folder, or overwrite=True")
-        expect_free(folder, (), ours=wanted.overwrite or same)
-        title = f"{self._plan.method} x{self._plan.scale}"
-        found = self._found.without_dubious(wanted.max_error / 100) if wanted.certain else self._found
-        result = Result(self._picture, found, output_encoding(self._picture.encoding, wanted.format), title, wanted)
-        times = Times(SILENT, upsampling=self._seconds)
-        times.begin("writing")
-        begin(folder, settings, inputs, () if earlier is None else earlier.files)
-        kept = earlier if same else None
-        notes, *_ = write_result(folder, result, self._plan, times, inputs, settings, earlier, kept)
-        warn(note for note in notes if note.code)
-        run = read_previous_run(folder)
-        files = [] if run is None else [folder / name for name in run.files]
+        path, limit = wanted.output, wanted.max_error / 100
+        folder = ResultFolder(path, inputs, {"max_error": limit}, overwrite=wanted.overwrite)
+        folder.expect_agreement("take another folder, or overwrite=True")
+        folder.expect_free()
+        found = self._found.without_dubious(limit) if wanted.certain else self._found
+        stored = folder.store(Result(self._picture, found, self._plan, wanted), {"upsampling": self._seconds})
+        warn(note for note in stored.notes if note.code)
+        files = [path / name for name in read_complete(path)["files"]]
         if not wanted.of_all:
             return files
-        scene = write_scene(folder, {folder.name: folder}, wanted.of_all, overwrite=wanted.overwrite)
+        scene = write_scene(path, {path.name: path}, wanted.of_all, overwrite=wanted.overwrite)
         if scene.problems:
             raise ValueError(scene.problems[0])
         return files + list(scene.files.values())
