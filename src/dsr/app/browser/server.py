@@ -27,8 +27,8 @@ from rich.console import Console
 from dsr.app.browser.jobs import Desk, RefusedError, Upload
 from dsr.app.browser.work import SHOWN, What
 from dsr.app.requests import BrowserRequest
+from dsr.io.captures.registry import CAPTURE_FILES
 from dsr.io.depth_files import READ_SUFFIXES
-from dsr.io.layouts import CAPTURE_FILES
 from dsr.io.pairs import PHOTO_SUFFIXES
 from dsr.report.html_page import asset, block, fill, json_text, policy
 from dsr.report.surface_page import VIEWER
