@@ -23,9 +23,10 @@ import math
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,7 +37,7 @@ from dsr.io.frames import CaptureFrame, Geometry, Record, Size, Source, file_sta
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
-from dsr.utils.guards import decode_text, leads_outside, naming, natural_key, numbers_in, read_limited
+from dsr.utils.guards import decode_text, leads_outside, naming, natural_key, numbers_in, read_limited, refusing
 from dsr.utils.versions import hash_once
 
 _APP = "COLMAP"
@@ -107,11 +108,18 @@ def _beside(file: Path, name: str) -> Path:
     return file.with_name(name + file.suffix)
 
 
+def _damaged(path: Path) -> AbstractContextManager[None]:
+    """Name a file that ends early."""
+    return refusing(f"{path}: expected a model of {_APP}, got a damaged or truncated file", struct.error)
+
+
 def _read_model(file: Path) -> _Sparse:
     """Read a model, given its file of images, with that of cameras beside it."""
     path, binary = _beside(file, "cameras"), file.suffix == ".bin"
-    cameras = (_cameras_of_bytes if binary else _cameras_of_text)(path, read_limited(path, _LARGEST))
-    images = (_images_of_bytes if binary else _images_of_text)(file, read_limited(file, _LARGEST))
+    with _damaged(path):
+        cameras = (_cameras_of_bytes if binary else _cameras_of_text)(path, read_limited(path, _LARGEST))
+    with _damaged(file):
+        images = (_images_of_bytes if binary else _images_of_text)(file, read_limited(file, _LARGEST))
     for image in images:
         if image.camera not in cameras:
             raise ValueError(f"{file}: image {image.name!r:.80}: expected a camera of the model, got {image.camera}")
@@ -252,40 +260,22 @@ def _pose(place: str, quaternion: Sequence[float], translation: Sequence[float])
 
 @dataclass
 class _Bytes:
-    """A binary file, read from its beginning; ``place`` is how far."""
+    """A binary file, read from its beginning; ``place`` is how far. A struct.error if it ends early."""
 
-    path: Path
     content: bytes
     place: int = 0
 
-    def read(self, layout: str) -> tuple[float, ...]:
-        """Return the next numbers of a layout of :mod:`struct`."""
-        layout = f"<{layout}"
-        self.expect(struct.calcsize(layout))
-        found = struct.unpack_from(layout, self.content, self.place)
-        self.place += struct.calcsize(layout)
+    def read(self, layout: str) -> tuple[Any, ...]:
+        """Return the next values of a layout of :mod:`struct`."""
+        found = struct.unpack_from(f"<{layout}", self.content, self.place)
+        self.place += struct.calcsize(f"<{layout}")
         return found
-
-    def count(self, least: int) -> int:
-        """Return the next number of records, of ``least`` bytes each."""
-        (count,) = self.read("Q")
-        self.expect(int(count) * least)
-        return int(count)
-
-    def expect(self, length: int) -> None:
-        """Raise ValueError unless as many bytes follow."""
-        if length > len(self.content) - self.place:
-            left = len(self.content) - self.place
-            raise ValueError(f"{self.path}: expected {length} bytes more of a model of {_APP}, got {left}")
 
     def text(self) -> str:
         """Return the next text, which ends with a 0."""
-        end = self.content.find(b"\0", self.place)
-        if end < 0:
-            raise ValueError(f"{self.path}: expected the name of an image, got no end of it")
-        found = self.content[self.place : end].decode("utf-8", "replace")
-        self.place = end + 1
-        return found
+        length = self.content.find(b"\0", self.place) - self.place
+        found, _ = self.read(f"{length}sc")
+        return str(found.decode("utf-8", "replace"))
 
 
 def _checked(
@@ -305,27 +295,26 @@ def _checked(
 
 def _cameras_of_bytes(path: Path, content: bytes) -> dict[int, _Camera]:
     """Return the cameras of ``cameras.bin`` by their numbers."""
-    file, cameras = _Bytes(path, content), {}
-    for _ in range(file.count(24)):
+    file, cameras = _Bytes(content), {}
+    for _ in range(*file.read("Q")):
         number, kind, width, height = file.read("iiQQ")
-        model = _MODELS.get(int(kind))
+        model = _MODELS.get(kind)
         numbers = () if model is None else file.read(f"{model.focal + 2 + model.bends}d")
-        cameras[int(number)] = _checked(path, model, kind, width, height, numbers)
+        cameras[number] = _checked(path, model, kind, width, height, numbers)
     return cameras
 
 
-def _images_of_bytes(path: Path, content: bytes) -> list[_Image]:
+def _images_of_bytes(_path: Path, content: bytes) -> list[_Image]:
     """Return the images of ``images.bin``."""
-    file, images = _Bytes(path, content), []
-    for _ in range(file.count(73)):
+    file, images = _Bytes(content), []
+    for _ in range(*file.read("Q")):
         _, *numbers, camera = file.read("I7dI")
-        name, count = file.text(), file.count(24)
-        kinds = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
-        stored = np.frombuffer(content, kinds, count, file.place)
-        file.place += 24 * count
+        name, (count,) = file.text(), file.read("Q")
+        (observations,) = file.read(f"{24 * count}s")
+        stored = np.frombuffer(observations, [("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
         points = np.where(stored["point"] == _NONE, -1.0, stored["point"].astype(np.float64))
         observed = np.stack((stored["x"], stored["y"], points), axis=1)
-        images.append(_Image(name, tuple(numbers[:4]), tuple(numbers[4:]), int(camera), observed))
+        images.append(_Image(name, tuple(numbers[:4]), tuple(numbers[4:]), camera, observed))
     return images
 
 
@@ -373,13 +362,12 @@ def _points(path: Path, _state: tuple[int, int]) -> tuple[np.ndarray, np.ndarray
     content, number = read_limited(path, _LARGEST), "<f8"
     stored = bytearray()  # number and place of each
     if path.suffix == ".bin":
-        number, file = "<u8", _Bytes(path, content)
-        for _number in range(file.count(51)):
-            file.expect(51)
-            stored += content[file.place : file.place + 32]
-            file.place += 43
-            length = 8 * file.count(8)
-            file.place += length
+        number, file = "<u8", _Bytes(content)
+        with _damaged(path):
+            for _number in range(*file.read("Q")):
+                stored += file.read("32s11x")[0]
+                (count,) = file.read("Q")
+                file.read(f"{8 * count}x")
     else:
         for line in filter(str.strip, _lines(content)):
             numbers = numbers_in(line.split()[:4])

@@ -22,11 +22,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import AliasPath, BaseModel, Field
 
 from dsr.geometry.camera import Camera, Lens
 from dsr.geometry.poses import as_rigid, invert
@@ -60,40 +60,22 @@ _DEPTH = "b16g"
 _LOCK = threading.Lock()
 
 
-class _Motion(BaseModel):
-    """Of the rig's frame to a camera's."""
-
-    Rotation: Annotated[list[Number], Field(min_length=9, max_length=9)]
-    Translation: Annotated[list[Number], Field(min_length=3, max_length=3)]
-
-
-class _Intrinsics(BaseModel):
-    """See the module's text."""
-
-    ModelType: str
-    ModelParameters: Annotated[list[Number], Field(min_length=14)]
-
-
 class _Camera(BaseModel):
-    """One of the cameras."""
+    """One of the cameras, and the motion from the rig's frame to its own; see the module's text."""
 
-    Location: str
-    Intrinsics: _Intrinsics
-    Rt: _Motion
-    SensorWidth: Annotated[Whole, Field(ge=1)]
-    SensorHeight: Annotated[Whole, Field(ge=1)]
-
-
-class _Cameras(BaseModel):
-    """What is read of the calibration."""
-
-    Cameras: list[_Camera]
+    location: str = Field(alias="Location")
+    kind: str = Field(validation_alias=AliasPath("Intrinsics", "ModelType"))
+    numbers: list[Number] = Field(validation_alias=AliasPath("Intrinsics", "ModelParameters"), min_length=14)
+    rotation: list[Number] = Field(validation_alias=AliasPath("Rt", "Rotation"), min_length=9, max_length=9)
+    translation: list[Number] = Field(validation_alias=AliasPath("Rt", "Translation"), min_length=3, max_length=3)
+    width: Whole = Field(alias="SensorWidth", ge=1)
+    height: Whole = Field(alias="SensorHeight", ge=1)
 
 
 class _Calibration(BaseModel):
     """The attachment."""
 
-    CalibrationInformation: _Cameras
+    cameras: list[_Camera] = Field(validation_alias=AliasPath("CalibrationInformation", "Cameras"))
 
 
 @dataclass(frozen=True)
@@ -213,7 +195,7 @@ def _track(path: Path, container: Any, role: str) -> Any:
 def _geometry(place: str, content: bytes, size: Size, size_lr: Size) -> Geometry:
     """Return the cameras of a recording with photos and depth maps of (height, width)."""
     calibration = parse_model(_Calibration, content.rstrip(b"\0"), place, f"expected the calibration of {_APP}; ")
-    cameras = {each.Location: each for each in calibration.CalibrationInformation.Cameras}
+    cameras = {each.location: each for each in calibration.cameras}
     for location in (_COLOUR_CAMERA, _DEPTH_CAMERA):
         if location not in cameras:
             raise ValueError(f"{place}: expected the camera {location}, there is none")
@@ -222,17 +204,17 @@ def _geometry(place: str, content: bytes, size: Size, size_lr: Size) -> Geometry
         raise ValueError(f"{place}: expected depth maps of {sizes}, got {size_lr[1]} x {size_lr[0]}")
     photo, depth = cameras[_COLOUR_CAMERA], cameras[_DEPTH_CAMERA]
     width = size[1]
-    numbers = photo.Intrinsics.ModelParameters
-    if photo.SensorWidth * 9 == photo.SensorHeight * 16:  # of old devices: the middle three quarters of the image
+    numbers = photo.numbers
+    if photo.width * 9 == photo.height * 16:  # of old devices: the middle three quarters of the image
         numbers = [numbers[0], (numbers[1] * 0.75) + 0.125, numbers[2], numbers[3] * 0.75, *numbers[4:]]
     whole = (width * 3 // 4, width)
     camera = _scale(place, numbers, whole, (0, (whole[0] - size[0]) / 2), size)
     side, left, top = _DEPTH_MODES[size_lr]
-    own = _scale(place, depth.Intrinsics.ModelParameters, (side, side), (left, top), size_lr)
+    own = _scale(place, depth.numbers, (side, side), (left, top), size_lr)
     motions = []  # from the rig's frame to the cameras', (4, 4), metres
     for each in (depth, photo):
-        motion = np.column_stack((np.reshape(each.Rt.Rotation, (3, 3)), each.Rt.Translation))
-        motions.append(as_rigid(motion, f"{place}: Rt of {each.Location}"))
+        motion = np.column_stack((np.reshape(each.rotation, (3, 3)), each.translation))
+        motions.append(as_rigid(motion, f"{place}: Rt of {each.location}"))
     transform = motions[1] @ invert(motions[0])
     return Geometry(camera, lens=_lens(place, photo), rig=Rig(own, transform, _lens(place, depth)))
 
@@ -256,8 +238,8 @@ def _scale(place: str, numbers: Sequence[float], whole: Size, cut: tuple[float, 
 
 def _lens(place: str, camera: _Camera) -> Lens:
     """Return the lens of a camera."""
-    kind = camera.Intrinsics.ModelType
-    k1, k2, k3, k4, k5, k6, codx, cody, p2, p1 = camera.Intrinsics.ModelParameters[4:14]
+    kind = camera.kind
+    k1, k2, k3, k4, k5, k6, codx, cody, p2, p1 = camera.numbers[4:14]
     if kind != _LENS and (kind != _LENS_6KT or codx or cody):  # with a centre of its own: of devices that were not sold
         centre = f"({codx:g}, {cody:g})"
         raise ValueError(f"{place}: expected a lens of {_LENS}, got {kind:.60} of the centre {centre}")
