@@ -148,19 +148,18 @@ def _read(path: Path) -> PairingResult:
     """Return the frames of a recording."""
     with _LOCK, _demuxing(path):
         container = _open(path, file_state(path, "a recording"))
-        photos, depths = _shots(path, container)
+        photos, depths, sizes = _shots(path, container)
         attached = [bytes(each.data) for each in container.streams.attachments if each.name == "calibration.json"]
     if not attached:
         raise ValueError(f"{path}: expected a recording with the attachment calibration.json, there is none")
-    sizes = [shots[0].source.size if shots else (0, 0) for shots in (photos, depths)]
     geometry = stated(lambda: _geometry(f"{path}: calibration.json", attached[0], *sizes))
     found = pair_by_time(photos, depths, CaptureFrame(_APP, geometry, path, attached[0], apart=True), 1e-3)
     note = describe_capture(f"a recording of {_APP}", "millimetres", found.pairs, poses=False)
     return replace(found, assumptions=(note,))
 
 
-def _shots(path: Path, container: Any) -> tuple[list[Shot], list[Shot]]:
-    """Return photos and depth maps in order; the latter's times are those that their photos should have."""
+def _shots(path: Path, container: Any) -> tuple[list[Shot], list[Shot], tuple[Size, Size]]:
+    """Return photos and depth maps in order, with the times that both should have, and (height, width) of each."""
     color, depth = (_track(path, container, role) for role in ("color", "depth"))
     kind = color.metadata.get("K4A_COLOR_MODE", "MJPG").partition("_")[0]
     if kind not in ("MJPG", *_COLOURS):
@@ -178,7 +177,7 @@ def _shots(path: Path, container: Any) -> tuple[list[Shot], list[Shot]]:
             source = _Packet(path, track.index, packet.pts, (track.height, track.width), stored)
             seconds = packet.pts * float(packet.time_base) - late
             shots[role].append(Shot(path / role / f"{len(shots[role]):06}", source, seconds))
-    return shots["color"], shots["depth"]
+    return shots["color"], shots["depth"], ((color.height, color.width), (depth.height, depth.width))
 
 
 def _track(path: Path, container: Any, role: str) -> Any:

@@ -101,8 +101,8 @@ def _read_archive(path: Path) -> PairingResult:
 
     pairs = []
     for number in both:
-        sources = {"photo": member("jpg", number), "depth": member("depth", number, "<f4")}
-        frame = replace(_frame(path / "metadata", metadata, number), **sources)
+        frame = _frame(path / "metadata", metadata, number)
+        frame = replace(frame, photo=member("jpg", number), depth=member("depth", number, "<f4"))
         pair = Pair(f"{number:06}", files["jpg"][number], files["depth"][number], unit=1.0, capture=frame)
         if number in files["conf"]:
             confidence = ConfidenceMap(files["conf"][number], HIGHEST_LEVEL, member("conf", number, "u1"))
