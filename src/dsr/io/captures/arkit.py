@@ -36,10 +36,10 @@ from __future__ import annotations
 import functools
 import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import BaseModel, Field
 
 from dsr.io.captures.contract import LIDAR, Capture
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Size, stated
@@ -146,14 +146,27 @@ def _arkitscenes_geometry(place: str, intrinsics: Path | None, motion: _Motion |
     return stated(geometry)
 
 
-# A file of ``cameras``; numbers may be NaN here.
-_PolycamCamera: Any = create_model(
-    "_PolycamCamera",
-    __config__=ConfigDict(strict=True),
-    **dict.fromkeys(("fx", "fy", "cx", "cy"), (float, ...)),
-    **dict.fromkeys(("width", "height"), (Pixels, ...)),
-    **{f"t_{row}{column}": (float, ...) for row in range(3) for column in range(4)},
-)
+class _PolycamCamera(BaseModel, strict=True):
+    """A file of ``cameras``; numbers may be NaN here."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: Pixels
+    height: Pixels
+    t_00: float
+    t_01: float
+    t_02: float
+    t_03: float
+    t_10: float
+    t_11: float
+    t_12: float
+    t_13: float
+    t_20: float
+    t_21: float
+    t_22: float
+    t_23: float
 
 
 def _find_polycam(folder: Path) -> PairingResult | None:
