@@ -8,6 +8,7 @@ import zlib
 
 import cv2
 import numpy as np
+import OpenEXR
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -114,6 +115,18 @@ def record3d(path, compress=lzfse_block, **changes):
             archive.writestr(f"rgbd/{number}.depth", compress(depth(number).astype("<f4")))
             archive.writestr(f"rgbd/{number}.conf", compress(levels()))
     return path
+
+
+def record3d_export(folder):
+    """Write Record3D's export of EXR depth and photos."""
+    for number in range(FRAMES):
+        save(folder / "rgb" / f"{number}.jpg", photo(number))
+        (folder / "depth").mkdir(exist_ok=True)
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        with OpenEXR.File(header, {"R": depth(number).astype(np.float32)}) as file:
+            file.write(str(folder / "depth" / f"{number}.exr"))
+    (folder / "metadata.json").write_text(json.dumps(record3d_metadata()))
+    return folder
 
 
 def polycam_camera(number=0, **changes):

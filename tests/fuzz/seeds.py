@@ -411,7 +411,7 @@ def record3d_folder(folder: Path) -> None:
 
 def record3d_export(folder: Path) -> None:
     """Write an export of Record3D."""
-    unit("test_io_captures").write_export(folder)
+    captures.record3d_export(folder)
 
 
 def sintel(folder: Path) -> None:

@@ -176,7 +176,7 @@ def test_cameras_poses_and_lenses_are_those_of_the_model(folder, writer, kind):
     _, numbers, lens = MODELS[kind]
     fy = F + 1 if numbers[1] == F + 1 else F
     for number, pair in enumerate(pickle.loads(pickle.dumps(found.pairs))):
-        geometry = pair.capture.geometry((HEIGHT, WIDTH))
+        geometry = pair.capture.geometry_of((HEIGHT, WIDTH))
         assert geometry.camera == Camera(WIDTH, HEIGHT, F, fy, CX - 0.5, CY - 0.5)
         np.testing.assert_allclose(geometry.pose, pose(number), atol=1e-12)
         assert geometry.lens == lens
@@ -218,11 +218,11 @@ def test_model_of_a_recording_leaves_it_its_depth_camera_and_its_times(tmp_path)
     joined = add_model(found, model_file(tmp_path / "model"))
     size = photos[0].shape[:2]
     for number, (before, after) in enumerate(zip(found.pairs, pickle.loads(pickle.dumps(joined.pairs)), strict=True)):
-        own, geometry = before.capture.geometry(size), after.capture.geometry(size)
+        own, geometry = before.capture.geometry_of(size), after.capture.geometry_of(size)
         assert geometry.rig is not None
         np.testing.assert_array_equal(geometry.rig.transform, own.rig.transform)
         assert (geometry.rig.camera, geometry.rig.lens) == (own.rig.camera, own.rig.lens)
-        assert after.capture.time == before.capture.time is not None
+        assert after.time == before.time is not None
         np.testing.assert_allclose(geometry.pose, pose(number), atol=1e-12)
         assert geometry.lens == MODELS["OPENCV"][2]
         assert after.capture.record() != before.capture.record()

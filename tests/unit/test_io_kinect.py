@@ -132,7 +132,7 @@ def test_recordings_in_a_folder_are_found_among_other_videos(tmp_path):
 def test_cameras_of_other_modes_are_parts_of_the_same_image(tmp_path, size, size_lr, expected):
     dark = np.zeros((*size, 3), np.uint8)
     (pair,) = find_pairs_of_folder(captures.kinect(tmp_path / "scan.mkv", [dark], [np.ones(size_lr, "u2")])).pairs
-    geometry = pair.capture.geometry(size)
+    geometry = pair.capture.geometry_of(size)
     for name in ("width", "height", "fx", "fy", "cx", "cy"):
         assert getattr(geometry.camera, name) == pytest.approx(getattr(expected, name))
     left, top = {(576, 640): (192, 180), (1024, 1024): (0, 0)}[size_lr]
@@ -211,7 +211,7 @@ def test_damaged_calibrations_are_refused(tmp_path, calibration):
 def test_damaged_recordings_are_refused(tmp_path, old, new):
     path = write(tmp_path / "scan.mkv")
     path.write_bytes(path.read_bytes().replace(old, new))
-    with pytest.raises(ValueError, match=r"scan\.mkv: ") as caught:
+    with pytest.raises(ValueError, match=r"scan\.mkv[:/]") as caught:
         pictures(path)
     assert "\n" not in str(caught.value)
 

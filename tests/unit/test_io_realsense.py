@@ -159,7 +159,7 @@ def test_recording_without_a_stream_of_an_old_version_or_interrupted_is_one_line
     cases = {
         content.replace(b"Color_0", b"Other_0"): "a.bag: expected a stream Color of RealSense's SDK, got Depth, Other",
         content[:4096].replace(content[content.index(b"index_pos=") + 10 :][:8], bytes(8)) + content[4096:]:
-            "a.bag: expected a finished recording, this one was interrupted",
+            "a.bag: expected a recording of ROS, got a damaged one .Bag is not indexed, reindex",
     }  # fmt: skip
     for changed, said in cases.items():
         path.write_bytes(changed)

@@ -30,7 +30,6 @@ from dsr.app.requests import (
     ViewRequest,
 )
 from dsr.app.upsample.request import UpsampleRequest
-from dsr.io.formats import FORMATS, rows, show
 from dsr.utils.options import Options, add_options, build
 
 
@@ -84,14 +83,16 @@ def add_commands(parser: argparse.ArgumentParser) -> None:
 
 def show_formats(request: FormatsRequest, console: Console) -> list[str]:
     """Print the formats that are read."""
-    words = [word.lower() for word in request.names]
+    from dsr.io.captures.registry import all_captures  # noqa: PLC0415 - it takes seconds to import
+
+    words, known = [word.lower() for word in request.names], all_captures()
     found = [
-        each for each in FORMATS
-        if not words or any(word in text.lower() for word in words for text in rows(each).values())
+        each for each in known
+        if not words or any(word in text.lower() for word in words for text in each.rows().values())
     ]  # fmt: skip
     if not found:
-        raise ValueError(f"{' '.join(words)}: expected a word of {', '.join(each.name for each in FORMATS)}")
-    console.print(show(found), markup=False, highlight=False, soft_wrap=True)
+        raise ValueError(f"{' '.join(words)}: expected a word of {', '.join(each.name for each in known)}")
+    console.print("\n\n".join(map(str, found)), markup=False, highlight=False, soft_wrap=True)
     return []
 
 

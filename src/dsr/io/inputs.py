@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -31,10 +30,10 @@ from dsr.io.cameras import (
 )
 from dsr.io.depth_files import ICL_CAMERA, ICL_SUFFIX, read_depth_file
 from dsr.io.encoding import Encoding, decode, expect_known, find_holes, turn_back_bits
-from dsr.io.frames import SLACK, Geometry, Rig
+from dsr.io.frames import SLACK, Geometry, Rig, Size
 from dsr.io.images import pixels_in_header, read_mask
 from dsr.io.pairs import Pair, find_camera_file, role_of_words, words_of
-from dsr.io.photos import Size, model_in_exif, read_photo, same_aspect
+from dsr.io.photos import model_in_exif, read_photo, same_aspect
 from dsr.io.reading import SUNRGBD_BITS, CameraChoice, Reading
 from dsr.io.units import TURNED_BACK, Meaning, expect_narrow, interpret
 from dsr.notes import LIMITS, Assumption
@@ -42,98 +41,50 @@ from dsr.sample import FARTHEST, NEAREST
 from dsr.utils.guards import natural_key, pixels_beside
 from dsr.utils.progress import show_length
 
-Kind = tuple[Path, str, str]
-"""Folder, suffix and type of value: maps alike in them have one unit."""
-
+_Kind = tuple[Path, str, str, bool]  # folder, suffix, type of value, and whether disparities were ruled out
 _DISPARITY_WORDS = frozenset({"disparity", "disp"})
-
-
-_DOUBTED = 8
-"""About how many maps of a folder are asked whether what makes the first one doubtful holds for them, too."""
+_DOUBTED = 8  # about how many maps of a folder are asked whether what makes the first one doubtful holds for them, too
 
 
 class FolderUnits:
     """The unit and range type of each kind of map from the first by name that has a known pixel.
 
-    The guess depends on the pairs alone, not on their order, nor on which of them were read or finished before.
-
-    Args:
-        pairs: all pairs of the folder.
-
+    The guess depends on all pairs of the folder alone, not on their order, nor on which were read or finished before.
     """
 
     def __init__(self, pairs: Sequence[Pair] = ()) -> None:
-        self._pairs = pairs
-        self._meanings: dict[tuple[Kind, bool], Meaning] = {}
+        self._pairs = sorted(pairs, key=lambda pair: (natural_key(pair.depth.name), natural_key(pair.name)))
+        self._meanings: dict[_Kind, Meaning] = {}
 
     def interpret(
         self, pair: Pair, stored: np.ndarray, hole_value: float | None, camera: Camera, *, may_fall: bool
     ) -> Meaning:
-        """Identify unit and range type of the stored values of a map; see :func:`dsr.io.units.interpret`.
-
-        Args:
-            pair: the map's pair.
-            stored: (h, w) its values.
-            hole_value: an additional value of holes, also in the other maps.
-            camera: of the map's pixels.
-            may_fall: whether the values may be disparities.
-
-        Raises:
-            ValueError: no pixel is known, no usual unit makes the distances plausible, or two readings are as likely.
-
-        """
-        kind = _kind(pair, stored)
-        if (kind, may_fall) not in self._meanings:
+        """Identify unit and range type of a pair's stored values, (h, w); see :func:`dsr.io.units.interpret`."""
+        kind = (pair.depth.parent, pair.depth.suffix.lower(), str(stored.dtype), may_fall)
+        if kind not in self._meanings:
             path, first = next(self._maps(kind, hole_value), (pair.depth, stored))
             meaning = interpret(str(path), first, find_holes(first, hole_value)[0], camera, may_fall=may_fall)
-            if any(note.code for note in meaning.assumptions):
-                every = max(len(self._in_order) // _DOUBTED, 1)
-                for _, other in self._maps(kind, hole_value, every):
-                    notes = interpret(
-                        str(path), other, find_holes(other, hole_value)[0], camera, may_fall=False
-                    ).assumptions
-                    if not any(note.code for note in notes):  # the first one is an exception
-                        meaning = meaning._replace(
-                            assumptions=tuple(note for note in meaning.assumptions if not note.code)
-                        )
+            certain = tuple(note for note in meaning.assumptions if not note.code)
+            if len(certain) < len(meaning.assumptions):
+                for _, other in self._maps(kind, hole_value, max(len(self._pairs) // _DOUBTED, 1)):
+                    alike = interpret(str(path), other, find_holes(other, hole_value)[0], camera, may_fall=False)
+                    if not any(note.code for note in alike.assumptions):  # the first one is an exception
+                        meaning = meaning._replace(assumptions=certain)
                         break
-            self._meanings[kind, may_fall] = meaning
-        return self._meanings[kind, may_fall]
+            self._meanings[kind] = meaning
+        return self._meanings[kind]
 
-    def _maps(self, kind: Kind, hole_value: float | None, every: int = 1) -> Iterator[tuple[Path, np.ndarray]]:
+    def _maps(self, kind: _Kind, hole_value: float | None, every: int = 1) -> Iterator[tuple[Path, np.ndarray]]:
         """Yield those of every so many maps that are of a kind and have a known pixel."""
-        for pair in self._in_order[::every]:
+        for pair in self._pairs[::every]:
             if (pair.depth.parent, pair.depth.suffix.lower()) != kind[:2]:
                 continue
             try:
-                stored = read_values_of(pair)
+                stored = _stored(pair)
             except ValueError:  # a damaged map is reported when its own turn comes
                 continue
-            if _kind(pair, stored) == kind and not find_holes(stored, hole_value)[0].all():
+            if str(stored.dtype) == kind[2] and not find_holes(stored, hole_value)[0].all():
                 yield pair.depth, stored
-
-    @functools.cached_property
-    def _in_order(self) -> list[Pair]:
-        """All pairs by name."""
-        return sorted(self._pairs, key=lambda pair: (natural_key(pair.depth.name), natural_key(pair.name)))
-
-
-def read_values_of(pair: Pair) -> np.ndarray:
-    """Return the depth map of a pair as it is stored, (h, w).
-
-    Raises:
-        ValueError: it is missing or damaged.
-
-    """
-    if pair.capture is not None and pair.capture.depth is not None:
-        return pair.capture.depth.read()
-    photo = pixels_in_header(pair.rgb)
-    return read_depth_file(pair.depth, None if photo is None else pixels_beside(*photo))
-
-
-def _kind(pair: Pair, stored: np.ndarray) -> Kind:
-    """Return the kind of a map."""
-    return pair.depth.parent, pair.depth.suffix.lower(), str(stored.dtype)
 
 
 @dataclass(frozen=True)
@@ -168,33 +119,17 @@ class Picture:
 
 
 def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None) -> Picture:
-    """Return a pair of files as tensors.
-
-    Args:
-        reading: what the user says about them.
-        units: guesses the unit for the whole folder; None to guess it from this map alone.
-
-    Raises:
-        ValueError: a file is missing or damaged, or the files do not fit each other.
-
-    """
-    stored = read_values_of(pair)
+    """Return a pair of files as tensors, read as the user says; ``units`` are those of the whole folder."""
+    stored = _stored(pair)
     size_lr: Size = (stored.shape[0], stored.shape[1])
-    pixels, assumptions = _photo(pair, size_lr)
-    geometry, doubted = read_geometry(pair, (pixels.shape[0], pixels.shape[1]), reading)
-    described, camera_assumptions = _camera(pair, reading, geometry, (pixels.shape[0], pixels.shape[1]), size_lr)
-    expect_possible(described.camera, _camera_source(pair, reading))
-    given = reading.camera != CameraChoice()
-    lens = geometry.lens if geometry.camera is not None and not given else None
-    if given and geometry.lens is not None and geometry.lens.bends:
-        text = "the lens distortion that the capture states is not undone: the camera is given"
-        camera_assumptions = [*camera_assumptions, Assumption(text, str(geometry.lens))]
-    undone = []
-    if lens is not None and lens.bends:
-        pixels = undistort(pixels, described.camera, lens)
-        undone = [Assumption("the lens distortion of the photo is undone", str(lens))]
-    pixels, crop_assumptions = _crop_to_multiple(pixels, pair.factor, size_lr)
+    pixels, notes = _photo(pair, size_lr)
     size: Size = (pixels.shape[0], pixels.shape[1])
+    geometry, damaged = read_geometry(pair, size, reading)
+    described = _camera(pair, reading, geometry, size, size_lr, notes)
+    expect_possible(described.camera, _camera_source(pair, reading))
+    pixels, lens = _undistorted(pixels, geometry, described.camera, reading, notes)
+    pixels = _cut(pixels, pair.factor, size_lr, notes)
+    size = (pixels.shape[0], pixels.shape[1])
     rig = _rig(pair, reading, geometry, size_lr)
     if rig is None:
         _expect_lower_resolution(pair, size, size_lr)
@@ -202,90 +137,45 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     if reading.baseline is not None:
         camera = replace(camera, baseline=reading.baseline)
     of_depth = camera.rescale(size_lr[1], size_lr[0]) if rig is None else rig.camera
-    units = FolderUnits() if units is None else units
-    found = _interpret(pair, reading, described, stored, units, of_depth)
-    stored, holes, meaning, range_type = found.stored, found.holes, found.meaning, found.range_type
-    hole_assumptions = list(found.hole_assumptions)
+    values = _interpret(pair, reading, described, stored, FolderUnits() if units is None else units, of_depth)
+    stored, holes, range_type = values.stored, values.holes, values.encoding.range_type
+    notes += [*values.notes, *values.hole_notes]
     if pair.mask is not None:
         holes |= ~_mask(pair.mask, size_lr)
-    confidence, confidence_assumptions = _confidence(pair, reading, size_lr, holes)
+    confidence, confident = _confidence(pair, reading, size_lr, holes)
     expect_known(pair.depth, stored, holes)
     lens_lr = lens if rig is None else rig.lens
-    stored, holes, confidence, undone_lr = _undistort_depth(stored, holes, confidence, of_depth, lens_lr)
-    encoding = Encoding(_suffix(pair), str(stored.dtype), meaning.unit, found.mark, range_type)
-    depth_lr = decode(stored, holes, encoding, of_depth)
-    hole_assumptions += _expect_distances(pair.depth, depth_lr, holes, range_type)
-    doubts = [*doubt_camera(described.camera, "camera", size_lr), *doubt_depth(depth_lr, of_depth, range_type)]
+    if lens_lr is not None and lens_lr.bends:
+        stored, holes = undistort(stored, of_depth, lens_lr, 0), undistort(holes, of_depth, lens_lr, hole=True)
+        confidence = None if confidence is None else undistort(confidence, of_depth, lens_lr, 0)
+        confident.append(Assumption("the lens distortion of the depth map is undone", str(lens_lr)))
+    depth_lr = decode(stored, holes, values.encoding, of_depth)
+    notes += [*_expect_distances(pair.depth, depth_lr, holes, range_type), *confident, *damaged]
+    notes += [*doubt_camera(described.camera, "camera", size_lr), *doubt_depth(depth_lr, of_depth, range_type)]
     rgb = torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1))).float() / 255
-    all_assumptions = (
-        *assumptions,
-        *camera_assumptions,
-        *undone,
-        *crop_assumptions,
-        *found.range_assumptions,
-        *meaning.assumptions,
-        *hole_assumptions,
-        *confidence_assumptions,
-        *undone_lr,
-        *doubted,
-        *doubts,
-    )
     if rig is not None:
         if range_type == "disparity" and camera.baseline is None:
             camera = replace(camera, baseline=rig.camera.baseline)  # that of the result's disparities, too
-        depth_lr, warped = _to_photo(pair, reading, depth_lr, rig, camera, rgb)
-        all_assumptions, confidence = (*all_assumptions, *warped), None
-    device_name = model_in_exif(pair.rgb) if pair.capture is None else pair.capture.app
-    time = pair.named_time if pair.own_time is None else pair.own_time
+        depth_lr = _to_photo(pair, reading, depth_lr, rig, camera, rgb, notes)
     return Picture(
-        rgb, depth_lr, camera, encoding, all_assumptions, geometry.pose, confidence, device_name, geometry.up, time
+        rgb,
+        depth_lr,
+        camera,
+        values.encoding,
+        tuple(notes),
+        geometry.pose,
+        None if confidence is None or rig is not None else torch.from_numpy(confidence)[None],
+        device_name=model_in_exif(pair.rgb) if pair.capture is None else pair.capture.app,
+        up=geometry.up,
+        time=pair.named_time if pair.time is None else pair.time,
     )
-
-
-class _Interpreted(NamedTuple):
-    """What the values of a map are: they with their bits turned back, their holes, and how they count."""
-
-    stored: np.ndarray
-    holes: np.ndarray
-    mark: float
-    meaning: Meaning
-    range_type: RangeType
-    range_assumptions: list[Assumption]
-    hole_assumptions: list[Assumption]
-
-
-def _interpret(
-    pair: Pair, reading: Reading, described: CameraFile, stored: np.ndarray, units: FolderUnits, camera: Camera
-) -> _Interpreted:
-    """Return what the values of a pair's map are, (h, w), which ``camera`` has taken."""
-    range_type, range_assumptions = _range_type(pair, reading, described)
-    meaning = _unit(pair, reading, described, range_type, stored, units, camera)
-    range_type = meaning.range_type or range_type or "orthogonal"
-    if range_type == "disparity" and camera.baseline is None:
-        raise ValueError(f"{pair.depth}: disparities need the distance between the two cameras: --baseline METRES")
-    if meaning.bits:
-        stored = turn_back_bits(str(pair.depth), stored, meaning.bits)
-    hole_value = described.hole_value if reading.hole_value is None else reading.hole_value
-    above = stored.shape[1] / meaning.unit if range_type == "disparity" else 0.0
-    above = math.inf if reading.hole_value == 0 else above
-    holes, mark, hole_assumptions = find_holes(stored, hole_value, above=above)
-    if range_type == "disparity" and reading.metres is None and meaning.unit == 1:
-        expect_narrow(str(pair.depth), stored[~holes], camera)
-    return _Interpreted(stored, holes, mark, meaning, range_type, range_assumptions, hole_assumptions)
 
 
 def read_map(path: Path, reading: Reading, camera: Camera | None = None) -> tuple[Tensor, tuple[Assumption, ...]]:
     """Return a depth map without its photo, (1, h, w) float32 in metres, NaN in holes, and what its values mean.
 
-    What a camera file beside it says of the values counts, as for a pair.
-
-    Args:
-        reading: what the user says about it.
-        camera: of the same view, of any size; None for that of the file beside it, or an assumed one.
-
-    Raises:
-        ValueError: it is missing or damaged, or its unit or range type is to be given.
-
+    What a camera file beside it says of the values counts, as for a pair. ``camera`` is of the same view, of any size;
+    None for that of the file beside it, or an assumed one.
     """
     stored = read_depth_file(path)
     size: Size = (stored.shape[0], stored.shape[1])
@@ -297,47 +187,77 @@ def read_map(path: Path, reading: Reading, camera: Camera | None = None) -> tupl
         own = camera_only(ICL_CAMERA if _is_icl(pair) else Camera.from_fov(ASSUMED_FOV, size[1], size[0]))
     of_depth = scale_to_depth(str(pair.camera or path) if camera is None else "camera", camera or own.camera, size)
     of_depth = replace(of_depth, baseline=reading.baseline or of_depth.baseline)
-    found = _interpret(pair, reading, own, stored, FolderUnits(), of_depth)
-    expect_known(path, found.stored, found.holes)
-    encoding = Encoding(_suffix(pair), str(found.stored.dtype), found.meaning.unit, found.mark, found.range_type)
-    depth = decode(found.stored, found.holes, encoding, of_depth)
-    _expect_distances(path, depth, found.holes, found.range_type)
-    notes = [*found.range_assumptions, *found.meaning.assumptions] if own.depth_unit is None else []
+    values = _interpret(pair, reading, own, stored, FolderUnits(), of_depth)
+    range_type = values.encoding.range_type
+    expect_known(path, values.stored, values.holes)
+    depth = decode(values.stored, values.holes, values.encoding, of_depth)
+    _expect_distances(path, depth, values.holes, range_type)
+    notes = values.notes if own.depth_unit is None else []
     known = camera is not None or isinstance(content, CameraFile) or _is_icl(pair)
-    if found.range_type != "orthogonal" and not known:
+    if range_type != "orthogonal" and not known:
         notes.append(Assumption(f"camera: none given, {ASSUMED_FOV:g} degrees of horizontal view assumed (--camera)"))
-    return depth, (*notes, *doubt_depth(depth, of_depth, found.range_type))
+    return depth, (*notes, *doubt_depth(depth, of_depth, range_type))
 
 
 def read_geometry(pair: Pair, size: Size, reading: Reading) -> tuple[Geometry, list[Assumption]]:
-    """Return the cameras, lenses and pose of a pair as its capture states them.
-
-    If it is damaged and a camera is given, or a model of COLMAP, that is what the model says, else nothing, with a
-    warning.
-
-    Args:
-        size: of the photo.
-
-    Raises:
-        ValueError: it is damaged, and no camera is given, or none for a depth map that is not in the photo's view.
-
-    """
+    """Return what the capture of a photo of some size states; damaged cameras are a warning if others are given."""
     if pair.capture is None:
         return Geometry(), []
-    try:
-        found = pair.capture.geometry(size)
-    except ValueError as error:
-        if reading.camera == CameraChoice():
-            raise
-        found = Geometry(damage=str(error))
+    found = pair.capture.geometry_of(size)
     if found.apart and reading.rig is None:
         raise ValueError(found.apart)
     if not found.damage:
         return found, []
-    if pair.capture.apart and reading.rig is None:
+    known = found.camera is not None or reading.camera != CameraChoice()  # of a model, or of the user
+    if not known or (pair.capture.apart and reading.rig is None):
         raise ValueError(found.damage)
     text = "the capture's cameras are damaged: the given one is used, and no pose or depth camera of the capture"
     return found, [Assumption(text, found.damage, "cameras-damaged", 1)]
+
+
+class _Values(NamedTuple):
+    """What the values of a map are: they with their bits turned back, their holes, and how they are encoded."""
+
+    stored: np.ndarray
+    holes: np.ndarray
+    encoding: Encoding
+    notes: list[Assumption]
+    hole_notes: list[Assumption]
+
+
+def _interpret(
+    pair: Pair, reading: Reading, described: CameraFile, stored: np.ndarray, units: FolderUnits, camera: Camera
+) -> _Values:
+    """Return what the values of a pair's map are, (h, w), which ``camera`` has taken."""
+    range_type, notes = _range_type(pair, reading, described)
+    meaning = _unit(pair, reading, described, range_type, stored, units, camera)
+    range_type = meaning.range_type or range_type or "orthogonal"
+    if range_type == "disparity" and camera.baseline is None:
+        raise ValueError(f"{pair.depth}: disparities need the distance between the two cameras: --baseline METRES")
+    if meaning.bits:
+        stored = turn_back_bits(str(pair.depth), stored, meaning.bits)
+    above = stored.shape[1] / meaning.unit if range_type == "disparity" else 0.0
+    above = math.inf if reading.hole_value == 0 else above
+    holes, mark, hole_notes = find_holes(stored, _hole_value(reading, described), above=above)
+    if range_type == "disparity" and reading.metres is None and meaning.unit == 1:
+        expect_narrow(str(pair.depth), stored[~holes], camera)
+    inside = pair.capture is not None and pair.capture.depth is not None
+    suffix = ".npy" if inside or _is_icl(pair) else pair.depth.suffix.lower()  # the others cannot be written
+    encoding = Encoding(suffix, str(stored.dtype), meaning.unit, mark, range_type)
+    return _Values(stored, holes, encoding, [*notes, *meaning.assumptions], hole_notes)
+
+
+def _hole_value(reading: Reading, described: CameraFile) -> float | None:
+    """Return an additional value of holes."""
+    return described.hole_value if reading.hole_value is None else reading.hole_value
+
+
+def _stored(pair: Pair) -> np.ndarray:
+    """Return the depth map of a pair as it is stored, (h, w)."""
+    if pair.capture is not None and pair.capture.depth is not None:
+        return pair.capture.depth.read()
+    photo = pixels_in_header(pair.rgb)
+    return read_depth_file(pair.depth, None if photo is None else pixels_beside(*photo))
 
 
 def _expect_distances(path: Path, depth_lr: Tensor, holes: np.ndarray, range_type: RangeType) -> list[Assumption]:
@@ -360,12 +280,6 @@ def _photo(pair: Pair, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]:
     return read_photo(pair.rgb, size_lr)
 
 
-def _suffix(pair: Pair) -> str:
-    """Return the suffix of the result: the input's, or that of NumPy's format where the input's cannot be written."""
-    inside = pair.capture is not None and pair.capture.depth is not None
-    return ".npy" if inside or _is_icl(pair) else pair.depth.suffix.lower()
-
-
 def _is_icl(pair: Pair) -> bool:
     """Return whether the depth map is a text file of ICL-NUIM."""
     return pair.capture is None and pair.depth.suffix.lower() == ICL_SUFFIX
@@ -373,8 +287,8 @@ def _is_icl(pair: Pair) -> bool:
 
 def _confidence(
     pair: Pair, reading: Reading, size_lr: Size, holes: np.ndarray
-) -> tuple[Tensor | None, list[Assumption]]:
-    """Return the confidence, (1, h, w), after adding pixels of too little of it to the holes, and the assumptions."""
+) -> tuple[np.ndarray | None, list[Assumption]]:
+    """Return the confidence, (h, w), after adding pixels of too little of it to the holes, and the assumptions."""
     if pair.confidence is None:
         if reading.min_confidence is not None:
             raise ValueError(f"{pair.depth}: expected a confidence map for --min-confidence, there is none")
@@ -386,19 +300,36 @@ def _confidence(
         holes |= unsure
         text = f"confidence below {reading.min_confidence:g} counts as a hole"
         assumptions = [Assumption(text, f"{float(unsure.mean()):.1%}")]
-    return torch.from_numpy(confidence)[None], assumptions
+    return confidence, assumptions
 
 
-def _crop_to_multiple(pixels: np.ndarray, factor: int | None, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]:
+def _undistorted(
+    pixels: np.ndarray, geometry: Geometry, camera: Camera, reading: Reading, notes: list[Assumption]
+) -> tuple[np.ndarray, Lens | None]:
+    """Return a photo without the lens distortion that its capture states, and the lens, unless the camera is given."""
+    if geometry.lens is None or not geometry.lens.bends:
+        return pixels, None
+    if reading.camera != CameraChoice():
+        text = "the lens distortion that the capture states is not undone: the camera is given"
+        notes.append(Assumption(text, str(geometry.lens)))
+        return pixels, None
+    if geometry.camera is None:
+        return pixels, None
+    notes.append(Assumption("the lens distortion of the photo is undone", str(geometry.lens)))
+    return undistort(pixels, camera, geometry.lens), geometry.lens
+
+
+def _cut(pixels: np.ndarray, factor: int | None, size_lr: Size, notes: list[Assumption]) -> np.ndarray:
     """Return the part of a photo that a depth map with ``factor`` times larger pixels covers."""
     if factor is None:
-        return pixels, []
-    covered = pixels[: size_lr[0] * factor, : size_lr[1] * factor]
-    if covered.shape == pixels.shape or covered.shape[:2] != (size_lr[0] * factor, size_lr[1] * factor):
-        return pixels, []
-    return covered, [
-        Assumption("the photo is cut to the part that the depth map covers", f"{pixels.shape[1]} x {pixels.shape[0]}")
-    ]
+        return pixels
+    size = size_lr[0] * factor, size_lr[1] * factor
+    covered = pixels[: size[0], : size[1]]
+    if covered.shape == pixels.shape or covered.shape[:2] != size:
+        return pixels
+    size_before = f"{pixels.shape[1]} x {pixels.shape[0]}"
+    notes.append(Assumption("the photo is cut to the part that the depth map covers", size_before))
+    return covered
 
 
 def _expect_lower_resolution(pair: Pair, size: Size, size_lr: Size) -> None:
@@ -417,23 +348,27 @@ def _expect_lower_resolution(pair: Pair, size: Size, size_lr: Size) -> None:
 
 
 def _camera(
-    pair: Pair, reading: Reading, geometry: Geometry, size: Size, size_lr: Size
-) -> tuple[CameraFile, list[Assumption]]:
+    pair: Pair, reading: Reading, geometry: Geometry, size: Size, size_lr: Size, notes: list[Assumption]
+) -> CameraFile:
     """Return the camera that the user gives, else the capture's, else that of a file beside it, else an assumed one."""
     if reading.camera != CameraChoice():
-        return find_camera(reading.camera, pair.rgb, size, size_lr)
-    if pair.capture is not None and geometry.camera is not None:
-        content, scaled = scale_to_photo(pair.capture.description, camera_only(geometry.camera), size)
-        return content, [*geometry.assumptions, *scaled]
+        found, more = find_camera(reading.camera, pair.rgb, size, size_lr)
+        notes += more
+        return found
     if pair.camera is None and _is_icl(pair) and size == size_lr:
-        return camera_only(ICL_CAMERA), [Assumption("camera: that of ICL-NUIM")]
-    if pair.camera is None:
-        content, assumed = find_camera(reading.camera, pair.rgb, size, size_lr)
-        return content, [*geometry.assumptions, *assumed]
-    described, assumptions = find_camera(CameraChoice(file=pair.camera), pair.rgb, size, size_lr)
-    own = pair.camera.stem == pair.rgb.stem  # one of each photo
-    found = Assumption(f"camera: {pair.camera.parent.name if own else pair.camera.name} beside the pictures")
-    return described, [*geometry.assumptions, found, *assumptions]
+        notes.append(Assumption("camera: that of ICL-NUIM"))
+        return camera_only(ICL_CAMERA)
+    notes += geometry.assumptions
+    if pair.capture is not None and geometry.camera is not None:
+        found, more = scale_to_photo(pair.capture.description, camera_only(geometry.camera), size)
+    elif pair.camera is None:
+        found, more = find_camera(reading.camera, pair.rgb, size, size_lr)
+    else:
+        found, more = find_camera(CameraChoice(file=pair.camera), pair.rgb, size, size_lr)
+        own = pair.camera.stem == pair.rgb.stem  # one of each photo
+        notes.append(Assumption(f"camera: {pair.camera.parent.name if own else pair.camera.name} beside the pictures"))
+    notes += more
+    return found
 
 
 def _rig(pair: Pair, reading: Reading, geometry: Geometry, size_lr: Size) -> Rig | None:
@@ -447,11 +382,11 @@ def _rig(pair: Pair, reading: Reading, geometry: Geometry, size_lr: Size) -> Rig
 
 
 def _to_photo(
-    pair: Pair, reading: Reading, depth_lr: Tensor, rig: Rig, photo: Camera, rgb: Tensor
-) -> tuple[Tensor, list[Assumption]]:
-    """Return a depth camera's map in the photo's view, and notes."""
+    pair: Pair, reading: Reading, depth_lr: Tensor, rig: Rig, photo: Camera, rgb: Tensor, notes: list[Assumption]
+) -> Tensor:
+    """Return a depth camera's map in the photo's view."""
     given = reading.rig is not None
-    doubts = doubt_camera(rig.camera, "--depth-camera" if given else "depth camera")
+    notes += doubt_camera(rig.camera, "--depth-camera" if given else "depth camera")
     warped, note = to_photo(depth_lr, rig, photo, "--extrinsics" if given else _camera_source(pair, reading))
     if given:
         inverse = torch.from_numpy(np.linalg.inv(rig.transform))[None]
@@ -462,20 +397,9 @@ def _to_photo(
             if gain >= LIMITS["extrinsics-inverse"]:
                 text = "--extrinsics: the photo's edges fit better with the inverse matrix"
                 detail = f"{better.figures}; expected the transform from the depth camera's frame to the photo camera's"
-                doubts.append(Assumption(text, detail, "extrinsics-inverse", gain))
-    return warped, [*doubts, note]
-
-
-def _undistort_depth(
-    stored: np.ndarray, holes: np.ndarray, confidence: Tensor | None, camera: Camera, lens: Lens | None
-) -> tuple[np.ndarray, np.ndarray, Tensor | None, list[Assumption]]:
-    """Return a map's values, its holes and its confidence without lens distortion, and a note if it had any."""
-    if lens is None or not lens.bends:
-        return stored, holes, confidence, []
-    if confidence is not None:
-        confidence = torch.from_numpy(undistort(confidence[0].numpy(), camera, lens, 0))[None]
-    note = Assumption("the lens distortion of the depth map is undone", str(lens))
-    return undistort(stored, camera, lens, 0), undistort(holes, camera, lens, hole=True), confidence, [note]
+                notes.append(Assumption(text, detail, "extrinsics-inverse", gain))
+    notes.append(note)
+    return warped
 
 
 def _camera_source(pair: Pair, reading: Reading) -> str:
@@ -529,5 +453,5 @@ def _unit(
         return Meaning(pair.unit, (), bits=pair.bits)
     if _is_icl(pair):
         return Meaning(1e-2, ())
-    hole_value = described.hole_value if reading.hole_value is None else reading.hole_value
+    hole_value = _hole_value(reading, described)
     return units.interpret(pair, stored, hole_value, camera, may_fall=range_type is None)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 from dsr.io.depth_files import READ_SUFFIXES
 from dsr.io.frames import CONFIDENCE_SUFFIXES, CaptureFrame, ConfidenceMap, find_highest
@@ -20,23 +21,22 @@ from dsr.utils.guards import natural_key
 Role = Literal["rgb", "depth", "other"]
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm", *HEIC_SUFFIXES)
 _DEPTH_ONLY = (".npy", ".npz", ".pfm", ".exr", ".depth")
-_RGB_WORDS = frozenset({"rgb", "color", "colour", "image", "images", "img", "imgs", "photo", "photos", "picture"})
-_DEPTH_WORDS = frozenset({"depth", "depths", "depthmap", "disparity", "disp", "range"})
-_OTHER_WORDS = frozenset(
-    {"mask", "masks", "confidence", "conf", "ir", "infrared", "normal", "normals", "label", "labels", "vis", "viz"}
-)
-_CONFIDENCE_WORDS = frozenset({"confidence", "conf"})
-_FILLERS = frozenset({"raw", "align", "aligned", "registered", "transformed", "warped", "map", "to", "frame", "in"})
+_CONFIDENCE = ("confidence", "conf")
+_WORDS: dict[Role, tuple[str, ...]] = {
+    "other": ("mask", "masks", *_CONFIDENCE, "ir", "infrared", "normal", "normals", "label", "labels", "vis", "viz"),
+    "depth": ("depth", "depths", "depthmap", "disparity", "disp", "range"),
+    "rgb": ("rgb", "color", "colour", "image", "images", "img", "imgs", "photo", "photos", "picture"),
+}  # the first role of which a name has a word is its
+_FILLERS = ("raw", "align", "aligned", "registered", "transformed", "warped", "map", "to", "frame", "in")
+_NOT_IN_KEYS = {*_WORDS["rgb"], *_WORDS["depth"], *_FILLERS}
 _REGISTERED = re.compile(
     r"(?<!not )\b(align|aligned|registered|transformed|warped|depths? (to|in|2) (rgb|colou?r|image))\b"
     r"(?!.* (to|in|2) (depth|ir|infra|infrared|left|right)\b)"
 )
-_SECONDS_BY_DIGITS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
-"""Times since 1970 as whole seconds, milli-, micro- and nanoseconds."""
-_MAX_GAP = 0.02
-"""Largest time in seconds between the two pictures of a pair."""
-_MOST_CANDIDATES, _RATE = 1 << 20, 40
-"""Pairs within that time that there may be at all, and for each photo, where there are more: at 1000 a second."""
+_SECONDS_BY_DIGITS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}  # of times since 1970 as whole numbers
+_MAX_GAP = 0.02  # seconds between the two pictures of a pair
+_MOST_CANDIDATES, _RATE = 1 << 20, 40  # pairs within that time, at all and for each photo: at 1000 a second
+_Key = TypeVar("_Key", int, str)
 
 CAMERA_NAMES = (
     "camera.json", "cam_params.json", "intrinsics.json", "intrinsic.json", "camera_intrinsic.json",
@@ -65,11 +65,7 @@ def role_of(path: Path) -> Role:
 def role_of_words(words: Iterable[str]) -> Role | None:
     """Return the role that words name, None where they name none."""
     words = set(words)
-    if words & _OTHER_WORDS:
-        return "other"
-    if words & _DEPTH_WORDS:
-        return "depth"
-    return "rgb" if words & _RGB_WORDS else None
+    return next((role for role, known in _WORDS.items() if words & {*known}), None)
 
 
 def is_registered(name: str) -> bool:
@@ -79,8 +75,7 @@ def is_registered(name: str) -> bool:
 
 def key_of(path: Path) -> tuple[str, ...]:
     """Return the words of a name without those that say its role, which are equal for the two files of a pair."""
-    words = words_of(path.stem)
-    return tuple(word for word in words if word not in _RGB_WORDS | _DEPTH_WORDS | _FILLERS)
+    return tuple(word for word in words_of(path.stem) if word not in _NOT_IN_KEYS)
 
 
 def time_of(path: Path) -> float | None:
@@ -115,43 +110,46 @@ def match_names(photos: Iterable[Path], depths: Iterable[Path]) -> list[tuple[Pa
     for path in depths:
         by_key.setdefault(key_of(path), []).append(path)
     partner = {path: by_key[key_of(path)].pop(0) for path in photos if by_key.get(key_of(path))}
-    left = set(depths) - set(partner.values())
-    partner |= match_times(
-        {path: time for path in photos if path not in partner and (time := time_of(path)) is not None},
-        {path: time for path in left if (time := time_of(path)) is not None},
-    )
+    used = set(partner.values())
+    left, alone = [path for path in photos if path not in partner], [path for path in depths if path not in used]
+    times = ([time_of(path) or math.nan for path in each] for each in (left, alone))
+    for place, other in match_times(*times):
+        partner[left[place]] = alone[other]
     return [(path, partner[path]) for path in photos if path in partner]
 
 
-def match_times(photos: dict[Path, float], depths: dict[Path, float]) -> dict[Path, Path]:
-    """Return which depth map was taken with which photo: the nearest first, each used once, within 20 ms.
+def match_times(photos: Sequence[float], depths: Sequence[float]) -> list[tuple[int, int]]:
+    """Return the places of the times in seconds that belong together, in the order of the photos.
 
-    Those without a finite time belong to none.
-
-    Raises:
-        ValueError: far more are within that time of each other than any cameras take.
-
+    The nearest are paired first, each once, within 20 ms; times that are not finite with none. A ValueError if far more
+    are that near than any cameras take.
     """
-    ordered = [sorted((path for path in each if math.isfinite(each[path])), key=each.__getitem__)
-               for each in (photos, depths)]  # fmt: skip
-    order, candidates, first = ordered[1], [], 0
-    for path in ordered[0]:
-        while first < len(order) and depths[order[first]] < photos[path] - _MAX_GAP:
+    order = sorted((place for place, time in enumerate(depths) if math.isfinite(time)), key=depths.__getitem__)
+    candidates, first = [], 0
+    for place in sorted((place for place, time in enumerate(photos) if math.isfinite(time)), key=photos.__getitem__):
+        while first < len(order) and depths[order[first]] < photos[place] - _MAX_GAP:
             first += 1
         for other in order[first:]:
-            gap = depths[other] - photos[path]
+            gap = depths[other] - photos[place]
             if gap > _MAX_GAP:
                 break
-            candidates.append((abs(gap), path, other))
+            candidates.append((abs(gap), place, other))
         if len(candidates) > max(_MOST_CANDIDATES, _RATE * len(photos)):
-            raise ValueError(f"{path}: expected frames of different times, got too many within {_MAX_GAP:g} s")
-    partner: dict[Path, Path] = {}
-    taken: set[Path] = set()
-    for _, path, other in sorted(candidates):
-        if path not in partner and other not in taken:
-            partner[path] = other
+            raise ValueError(f"expected frames of different times, got too many within {_MAX_GAP:g} s")
+    partner: dict[int, int] = {}
+    taken: set[int] = set()
+    for _, place, other in sorted(candidates):
+        if place not in partner and other not in taken:
+            partner[place] = other
             taken.add(other)
-    return partner
+    return sorted(partner.items())
+
+
+def paired(photos: Mapping[_Key, Path], depths: Mapping[_Key, Path]) -> tuple[list[_Key], tuple[Path, ...]]:
+    """Return the numbers or names that photos and depth maps have in common, and the files without a partner."""
+    both = [key for key in photos if key in depths]
+    known = set(both)
+    return both, tuple(path for each in (photos, depths) for key, path in each.items() if key not in known)
 
 
 @dataclass(frozen=True)
@@ -161,14 +159,14 @@ class Pair:
     Args:
         name: name of the result, unique among the pairs found together.
         rgb, depth: files of the photo and the depth map; names of their places in a capture that has no such files.
-        camera: camera file beside them; None for none.
-        mask: picture that is 0 where depth is missing; None for none.
+        camera: camera file beside them.
+        mask: picture that is 0 where depth is missing.
         unit: metres per value if the layout defines it.
         factor: upsampling factor if the file's name has it, as in ``depth_lr4.npy``.
-        capture: what the capture that the pair is of says about it; None if it is of none.
-        confidence: where its confidence map is; None for none.
+        capture: what the capture that the pair is of says about it.
+        confidence: where its confidence map is.
         bits: how far the layout turns values of 16 bits to the left; the unit holds after turning them back.
-        time: of the photo in seconds, if a list beside the files has it.
+        time: of the photo in seconds, if the capture or a list of the files states it.
 
     """
 
@@ -185,11 +183,6 @@ class Pair:
     time: float | None = None
 
     @property
-    def own_time(self) -> float | None:
-        """The time in seconds that the capture, or a list of the files, states for the frame; None if neither does."""
-        return self.time if self.capture is None or self.capture.time is None else self.capture.time
-
-    @property
     def named_time(self) -> float | None:
         """The time in seconds in the names of the files; None if there is none."""
         time = time_of(self.depth)
@@ -198,35 +191,15 @@ class Pair:
 
 @dataclass(frozen=True)
 class PairingResult:
-    """What was found.
-
-    Args:
-        pairs: pairs in order.
-        assumptions: how they were recognised.
-        unpaired: pictures without a partner.
-
-    """
+    """The pairs that were found in order, notes on how they were recognised, and pictures without a partner."""
 
     pairs: tuple[Pair, ...]
     assumptions: tuple[Assumption, ...] = ()
     unpaired: tuple[Path, ...] = ()
 
 
-def join(parts: Iterable[PairingResult]) -> PairingResult:
-    """Join the pairs of several recordings of a folder, with each assumption once."""
-    parts = tuple(parts)
-    notes = dict.fromkeys(note for part in parts for note in part.assumptions)
-    pairs = tuple(pair for part in parts for pair in part.pairs)
-    return PairingResult(pairs, tuple(notes), tuple(path for part in parts for path in part.unpaired))
-
-
 def find_pairs_of_lists(photos: Sequence[Path], depths: Sequence[Path], masks: Sequence[Path] = ()) -> PairingResult:
-    """Return the pairs of files in the order given, or of two folders by the names in them.
-
-    Raises:
-        ValueError: the lists differ in length, mix files and folders, or nothing in the folders is a pair.
-
-    """
+    """Return the pairs of files in the order given, or of two folders by the names in them."""
     for name, paths in (("--rgb", photos), ("--depth", depths), ("--mask", masks)):
         for path in paths:
             if not path.exists():
@@ -253,10 +226,7 @@ def find_pairs_of_lists(photos: Sequence[Path], depths: Sequence[Path], masks: S
 
 
 def _common_folder(rgb: Path, depth: Path) -> Path:
-    """Return up to which folder a photo's camera file is searched: that of two folders side by side, as SUN RGB-D has.
-
-    Files of any other places have theirs beside the photo.
-    """
+    """Return up to which folder a photo's camera file is searched: that of two folders side by side, or its own."""
     folders = rgb.parent.absolute(), depth.parent.absolute()
     beside = folders[0] != folders[1] and folders[0].parent == folders[1].parent
     return rgb.parent.parent if beside and rgb.parent.name else rgb.parent
@@ -296,16 +266,7 @@ def match_pairs(photos: Iterable[Path], depths: Iterable[Path], camera: Path | N
 
 
 def add_confidence(pairs: Sequence[Pair], given: Sequence[Path]) -> tuple[Pair, ...]:
-    """Return pairs with the confidence maps that the user gives.
-
-    Args:
-        pairs: the pairs, in the order of the maps.
-        given: one map for each pair, or a folder of maps with the pairs' names, numbers or times.
-
-    Raises:
-        ValueError: there are fewer or more maps than pairs, a map is missing, or the values have no known range.
-
-    """
+    """Return pairs with the maps that the user gives: one for each in their order, or a folder of maps by names."""
     for path in given:
         if not path.exists():
             raise ValueError(f"--confidence: {path}: no such file or folder")
@@ -328,7 +289,7 @@ def _match_confidence(pairs: Sequence[Pair], folder: Path) -> list[Path]:
     maps = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() in CONFIDENCE_SUFFIXES:
-            maps[tuple(word for word in key_of(path) if word not in _CONFIDENCE_WORDS)] = path
+            maps[tuple(word for word in key_of(path) if word not in _CONFIDENCE)] = path
     found = [maps.get(key_of(pair.depth)) or maps.get(key_of(pair.rgb)) for pair in pairs]
     missing = [pair.name for pair, path in zip(pairs, found, strict=True) if path is None]
     if missing:
@@ -341,9 +302,22 @@ def _match_confidence(pairs: Sequence[Pair], folder: Path) -> list[Path]:
 
 def list_pictures(folder: Path) -> list[Path]:
     """Return the pictures and maps in a folder."""
+    return [folder / name for name in sorted(_picture_names(folder), key=natural_key)]
+
+
+def has_pictures(folder: Path) -> bool:
+    """Return whether there is a picture or map in a folder."""
+    return next(_picture_names(folder), None) is not None
+
+
+def _picture_names(folder: Path) -> Iterator[str]:
+    """Yield the names of the pictures and maps in a folder, which may have a million files."""
     with os.scandir(folder) as entries:  # knows files from folders without asking for each
-        names = [entry.name for entry in entries if _is_picture(entry)]
-    return [folder / name for name in sorted(names, key=natural_key)]
+        for entry in entries:
+            suffix = os.path.splitext(entry.name)[1]  # noqa: PTH122 - quicker than a Path
+            with contextlib.suppress(OSError):  # a link to itself
+                if suffix.lower() in _SUFFIXES and not entry.name.startswith(".") and entry.is_file():
+                    yield entry.name
 
 
 def numbered_files(folder: Path, suffixes: tuple[str, ...], before: str = "") -> dict[int, Path]:
@@ -359,23 +333,6 @@ def has_name(folder: Path, first: str, last: str) -> bool:
     """Return whether a file or folder in a folder has a name that begins and ends so."""
     with os.scandir(folder) as entries:  # a folder may have a million
         return any(entry.name.startswith(first) and entry.name.endswith(last) for entry in entries)
-
-
-def has_pictures(folder: Path) -> bool:
-    """Return whether there is a picture or map in a folder."""
-    with os.scandir(folder) as entries:
-        return any(_is_picture(entry) for entry in entries)
-
-
-def _is_picture(entry: os.DirEntry[str]) -> bool:
-    """Return whether an entry of a folder is a picture or map."""
-    suffix = os.path.splitext(entry.name)[1]  # noqa: PTH122 - a folder may have a million
-    if suffix.lower() not in _SUFFIXES or entry.name.startswith("."):
-        return False
-    try:
-        return entry.is_file()
-    except OSError:  # a link to itself
-        return False
 
 
 def make_names_unique(pairs: Iterable[Pair]) -> tuple[Pair, ...]:

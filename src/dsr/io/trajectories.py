@@ -50,7 +50,7 @@ class Trajectory:
         """
         if self.times is not None:
             named = _known([pair.named_time for pair in pairs])
-            own = _known([pair.own_time for pair in pairs])
+            own = _known([pair.time for pair in pairs])
             numbers = _known([_number(pair) for pair in pairs])
             ways = [(own, _MAX_GAP), *(way for way in ((named, _MAX_GAP), (numbers, 0.0)) if np.isfinite(way[0]).all())]
             found = [self._nearest(pairs, *way) for way in ways]

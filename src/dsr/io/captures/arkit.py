@@ -41,9 +41,10 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, Field
 
-from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry
+from dsr.io.captures.contract import LIDAR, Capture
+from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Size, stated
 from dsr.io.images import Pixels, read_numbers
-from dsr.io.pairs import Pair, PairingResult, has_name, numbered_files
+from dsr.io.pairs import Pair, PairingResult, has_name, numbered_files, paired
 from dsr.io.trajectories import (
     USUAL_SIZE,
     check_pose,
@@ -55,46 +56,37 @@ from dsr.notes import Assumption
 from dsr.utils.guards import natural_key, numbers_in, read_limited, read_text
 from dsr.utils.validation import parse_model
 
-_ARKITSCENES = "ARKitScenes"
-_LARGEST_PINCAM = 1 << 16
-"""Largest file of a camera in bytes."""
-_PHOTOS = ("wide", "color", "lowres_wide")
-_MAX_GAP = 0.010
-"""Largest time in seconds between a frame and its pose."""
+_ARKITSCENES, _POLYCAM, _SCANNER = "ARKitScenes", "Polycam", "3D Scanner App"
+_LARGEST_PINCAM, _LARGEST_JSON = 1 << 16, 1 << 20  # bytes of a file of a camera
+_MAX_GAP = 0.010  # seconds between a frame and its pose
 _SHIFTS = (0.0, -1e-3, 1e-3)
 _Motion = tuple[float, ...]
 
-_POLYCAM = "Polycam"
-_LARGEST_JSON = 1 << 20
-"""Largest file of a camera in bytes."""
-_SCANNER = "3D Scanner App"
-_KINDS = ("corrected_images", "images")
-_CAMERAS = {"corrected_images": "corrected_cameras", "images": "cameras"}
 
-
-def find_arkitscenes(folder: Path) -> PairingResult | None:
-    """Return the frames of a video of ARKitScenes; None if the folder is none."""
+def _find_arkitscenes(folder: Path) -> PairingResult | None:
+    """Return the frames of a video of ARKitScenes."""
     depths = {path.stem: path for path in (folder / "lowres_depth").glob("*.png")}
-    kind = next((kind for kind in _PHOTOS if any((folder / kind).glob("*.png"))), None)
+    kinds = ("wide", "color", "lowres_wide")
+    kind = next((kind for kind in kinds if any((folder / kind).glob("*.png"))), None)
     if not depths or kind is None:
         return None
     photos = {path.stem: path for path in sorted((folder / kind).glob("*.png"), key=natural_key)}
-    motions = _read_trajectory(folder / "lowres_wide.traj")
+    trajectory = folder / "lowres_wide.traj"
+    motions = _read_trajectory(trajectory)
+    both, unpaired = paired(photos, depths)
     pairs = []
-    for stem in [stem for stem in photos if stem in depths]:
+    for stem in both:
         intrinsics, motion = find_intrinsics(folder / f"{kind}_intrinsics", stem), _nearest(motions, stem)
-        place = f"{folder / 'lowres_wide.traj'}: frame {stem}"
-        geometry = functools.partial(_geometry, place, intrinsics, motion)
         described = (b"" if intrinsics is None else read_limited(intrinsics, _LARGEST_PINCAM)) + repr(motion).encode()
+        geometry = _arkitscenes_geometry(f"{trajectory}: frame {stem}", intrinsics, motion)
         time = _time(stem) if math.isfinite(_time(stem)) else None
-        frame = CaptureFrame(_ARKITSCENES, geometry, intrinsics or folder / "lowres_wide.traj", described, time=time)
+        frame = CaptureFrame(_ARKITSCENES, geometry, intrinsics or trajectory, described)
         path = folder / "confidence" / f"{stem}.png"
         known = ConfidenceMap(path, HIGHEST_LEVEL) if path.is_file() else None
-        pairs.append(Pair(stem, photos[stem], depths[stem], unit=1e-3, capture=frame, confidence=known))
+        pairs.append(Pair(stem, photos[stem], depths[stem], unit=1e-3, capture=frame, confidence=known, time=time))
     text = f"a video of {_ARKITSCENES}, photos of {kind}"
     note = describe_capture(text, "millimetres", pairs, poses=bool(motions))
-    lone = [each[stem] for each in (photos, depths) for stem in each if not (stem in photos and stem in depths)]
-    return PairingResult(tuple(pairs), (note,), tuple(lone))
+    return PairingResult(tuple(pairs), (note,), unpaired)
 
 
 def _read_trajectory(path: Path) -> dict[float, _Motion]:
@@ -129,26 +121,29 @@ def find_intrinsics(folder: Path, stem: str) -> Path | None:
     return next((folder / name for name in names if (folder / name).is_file()), None)
 
 
-def _geometry(place: str, intrinsics: Path | None, motion: _Motion | None, _: tuple[int, int]) -> Geometry:
+def _arkitscenes_geometry(place: str, intrinsics: Path | None, motion: _Motion | None) -> Geometry:
     """Return camera and pose of a frame."""
-    camera, pose, notes = None, None, []
-    if intrinsics is not None:
-        width, height, *numbers = read_numbers(intrinsics, 6).tolist()
-        if not (width >= 1 and height >= 1 and float(width).is_integer() and float(height).is_integer()):
-            raise ValueError(f"{intrinsics}: expected a width and a height in pixels, got {width:g} and {height:g}")
-        camera = intrinsics_camera(str(intrinsics), (int(height), int(width)), numbers)
-    if motion is None:
-        notes.append(Assumption("no pose: lowres_wide.traj has none within 10 ms of the frame"))
-    elif not np.isfinite(motion).all():
-        raise ValueError(f"{place}: expected a rigid pose, got {' '.join(f'{value:g}' for value in motion)}")
-    else:
+
+    def geometry() -> Geometry:
+        camera = None
+        if intrinsics is not None:
+            width, height, *numbers = read_numbers(intrinsics, 6).tolist()
+            if not (width >= 1 and height >= 1 and float(width).is_integer() and float(height).is_integer()):
+                raise ValueError(f"{intrinsics}: expected a width and a height in pixels, got {width:g} and {height:g}")
+            camera = intrinsics_camera(str(intrinsics), (int(height), int(width)), numbers)
+        if motion is None:
+            note = Assumption("no pose: lowres_wide.traj has none within 10 ms of the frame")
+            return Geometry(camera, None, (note,), up="z")
+        if not np.isfinite(motion).all():
+            raise ValueError(f"{place}: expected a rigid pose, got {' '.join(f'{value:g}' for value in motion)}")
         from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a third of a second that frames without poses save
 
         to_camera = np.eye(4)
         to_camera[:3, :3] = Rotation.from_rotvec(motion[:3]).as_matrix()
         to_camera[:3, 3] = motion[3:]
-        pose = check_pose(place, np.linalg.inv(to_camera))
-    return Geometry(camera, pose, tuple(notes), up="z")
+        return Geometry(camera, check_pose(place, np.linalg.inv(to_camera)), up="z")
+
+    return stated(geometry)
 
 
 class _PolycamCamera(BaseModel, strict=True):
@@ -174,40 +169,46 @@ class _PolycamCamera(BaseModel, strict=True):
     t_23: float
 
 
-def find_polycam(folder: Path) -> PairingResult | None:
-    """Return the frames of a raw export, or of its folder ``keyframes``; None if there are none."""
+def _find_polycam(folder: Path) -> PairingResult | None:
+    """Return the frames of a raw export, or of its folder ``keyframes``."""
     frames = folder / "keyframes" if (folder / "keyframes").is_dir() else folder
-    cameras = [kind for kind in _KINDS if (frames / kind).is_dir() and any((frames / _CAMERAS[kind]).glob("*.json"))]
-    if not cameras or not (frames / "depth").is_dir():
+    kinds = [
+        (frames / f"{kind}images", frames / f"{kind}cameras")
+        for kind in ("corrected_", "")
+        if (frames / f"{kind}images").is_dir() and any((frames / f"{kind}cameras").glob("*.json"))
+    ]
+    if not kinds or not (frames / "depth").is_dir():
         return None
-    photos = {kind: {path.stem: path for path in (frames / kind).glob("*.jpg")} for kind in cameras}
     pairs, unpaired = [], []
     for depth in sorted((frames / "depth").glob("*.png"), key=natural_key):
-        files = {kind: frames / _CAMERAS[kind] / f"{depth.stem}.json" for kind in cameras if depth.stem in photos[kind]}
-        kind, path = next(((kind, file) for kind, file in files.items() if file.is_file()), (None, None))
-        if kind is None or path is None:
+        files = ((photos / f"{depth.stem}.jpg", cameras / f"{depth.stem}.json") for photos, cameras in kinds)
+        photo, camera = next(((each, file) for each, file in files if each.is_file() and file.is_file()), (None, None))
+        if photo is None or camera is None:
             unpaired.append(depth)
             continue
-        frame = CaptureFrame(
-            _POLYCAM, functools.partial(_polycam_geometry, path), path, read_limited(path, _LARGEST_JSON)
-        )
+        frame = CaptureFrame(_POLYCAM, _polycam_geometry(camera), camera, read_limited(camera, _LARGEST_JSON))
         confidence = frames / "confidence" / depth.name
         known = ConfidenceMap(confidence, 255) if confidence.is_file() else None
-        pairs.append(Pair(depth.stem, photos[kind][depth.stem], depth, unit=1e-3, capture=frame, confidence=known))
+        pairs.append(Pair(depth.stem, photo, depth, unit=1e-3, capture=frame, confidence=known))
     notes = [describe_capture(f"a capture of {_POLYCAM}", "millimetres", pairs, poses=True)]
-    corrected = sum(pair.rgb.parent.name == _KINDS[0] for pair in pairs)
+    corrected = sum(pair.rgb.parent.name == "corrected_images" for pair in pairs)
     if corrected:
         notes.append(Assumption("photos and cameras are the corrected ones", f"{corrected} of {len(pairs)}"))
     return PairingResult(tuple(pairs), tuple(notes), tuple(unpaired))
 
 
-def _polycam_geometry(path: Path, _: tuple[int, int]) -> Geometry:
+def _polycam_geometry(path: Path) -> Geometry:
     """Return camera and pose of a frame."""
-    stored = parse_model(_PolycamCamera, read_text(path, _LARGEST_JSON), path, f"expected {_POLYCAM}'s camera; ")
-    camera = intrinsics_camera(str(path), (stored.height, stored.width), (stored.fx, stored.fy, stored.cx, stored.cy))
-    rows = [[getattr(stored, f"t_{row}{column}") for column in range(4)] for row in range(3)]
-    pose = check_pose(str(path), np.array([*rows, [0, 0, 0, 1]], dtype=np.float64), opengl=True)
-    return Geometry(camera, pose, up="y")
+
+    def geometry() -> Geometry:
+        stored = parse_model(_PolycamCamera, read_text(path, _LARGEST_JSON), path, f"expected {_POLYCAM}'s camera; ")
+        numbers = stored.fx, stored.fy, stored.cx, stored.cy
+        camera = intrinsics_camera(str(path), (stored.height, stored.width), numbers)
+        rows = [[getattr(stored, f"t_{row}{column}") for column in range(4)] for row in range(3)]
+        pose = check_pose(str(path), np.array([*rows, [0, 0, 0, 1]], dtype=np.float64), opengl=True)
+        return Geometry(camera, pose, up="y")
+
+    return stated(geometry)
 
 
 class _ScannerFrame(BaseModel, strict=True):
@@ -217,8 +218,8 @@ class _ScannerFrame(BaseModel, strict=True):
     pose: Annotated[list[float], Field(min_length=16, max_length=16)] = Field(alias="cameraPoseARFrame")
 
 
-def find_scanner_app(folder: Path) -> PairingResult | None:
-    """Return the frames of an export of all data of 3D Scanner App; None if the folder is none."""
+def _find_scanner_app(folder: Path) -> PairingResult | None:
+    """Return the frames of an export of all data of 3D Scanner App."""
     if not has_name(folder, "frame_", ".json"):
         return None
     frames, photos = (numbered_files(folder, (suffix,), "frame_") for suffix in (".json", ".jpg"))
@@ -228,24 +229,23 @@ def find_scanner_app(folder: Path) -> PairingResult | None:
     if b"cameraPoseARFrame" not in read_limited(next(iter(frames.values())), _LARGEST_JSON):
         return None
     confidences = numbered_files(folder, (".png",), "conf_")
+    both, unpaired = paired(photos, depths)
     pairs = []
-    for number in sorted(photos.keys() & depths.keys()):
+    for number in both:
         path = frames.get(number)
         content = b"" if path is None else read_limited(path, _LARGEST_JSON)
         geometry = functools.partial(_scanner_geometry, path)
         frame = CaptureFrame(_SCANNER, geometry, path or folder / f"frame_{number:05}.json", content)
         known = ConfidenceMap(confidences[number], HIGHEST_LEVEL) if number in confidences else None
         unit = 1e-3 if depths[number].suffix.lower() == ".png" else None
-        pairs.append(
-            Pair(photos[number].stem, photos[number], depths[number], unit=unit, capture=frame, confidence=known)
-        )
+        name = photos[number].stem
+        pairs.append(Pair(name, photos[number], depths[number], unit=unit, capture=frame, confidence=known))
     unit_text = "millimetres" if all(pair.unit for pair in pairs) else "floats"
     note = describe_capture(f"a capture of {_SCANNER}", unit_text, pairs, poses=True)
-    lone = [each[number] for each in (photos, depths) for number in each if not (number in photos and number in depths)]
-    return PairingResult(tuple(pairs), (note,), tuple(lone))
+    return PairingResult(tuple(pairs), (note,), unpaired)
 
 
-def _scanner_geometry(path: Path | None, size: tuple[int, int]) -> Geometry:
+def _scanner_geometry(path: Path | None, size: Size) -> Geometry:
     """Return camera and pose of a frame."""
     if path is None:
         return Geometry(assumptions=(Assumption("no camera and no pose: there is no JSON of the frame"),))
@@ -254,3 +254,52 @@ def _scanner_geometry(path: Path | None, size: tuple[int, int]) -> Geometry:
     camera = fitting_camera(str(path), (size, USUAL_SIZE), (fx, fy, cx, cy))
     pose = check_pose(str(path), np.reshape(stored.pose, (4, 4)), opengl=True)
     return Geometry(camera, pose, up="y")
+
+
+ARKITSCENES = Capture(
+    _ARKITSCENES,
+    "`raw` or `3dod` of the data set",
+    "`lowres_depth/` with `wide/`, `color/` or `lowres_wide/`",
+    "depth in mm (16-bit PNG); intrinsics (`*.pincam`); poses by time; confidence 0 to 2",
+    "written by its format",
+    LIDAR,
+    "https://github.com/apple/ARKitScenes/blob/main/DATA.md",
+    _find_arkitscenes,
+    marks=("lowres_depth/*", "lowres_wide.traj"),
+    needs={
+        "lowres_depth/": ("lowres_depth/*.png",),
+        "wide/, color/ or lowres_wide/": ("wide/*.png", "color/*.png", "lowres_wide/*.png"),
+    },
+)
+POLYCAM = Capture(
+    _POLYCAM,
+    "raw data of a scan in developer mode",
+    "`keyframes/` with `cameras/*.json`",
+    "depth in mm (16-bit PNG); corrected photos, else all; intrinsics and pose of each frame; confidence",
+    "written by its format",
+    LIDAR,
+    "https://github.com/PolyCam/polyform#polycams-data-format",
+    _find_polycam,
+    marks=("keyframes/*",),
+    needs={
+        "keyframes/images/": ("keyframes/images/*.jpg", "keyframes/corrected_images/*.jpg"),
+        "keyframes/cameras/*.json": ("keyframes/cameras/*.json", "keyframes/corrected_cameras/*.json"),
+        "keyframes/depth/": ("keyframes/depth/*.png",),
+    },
+)
+SCANNER_APP = Capture(
+    _SCANNER,
+    "share the scan as All data, a folder or ZIP file",
+    "`frame_*.json` with `cameraPoseARFrame`, `frame_*.jpg`, `depth_*.png`",
+    "depth in mm (16-bit PNG; EXR); intrinsics and pose of each frame; confidence 0 to 2",
+    "two real scans, of 24 and 146 photos",
+    LIDAR,
+    "https://github.com/laanlabs/3dScannerApp_samples",
+    _find_scanner_app,
+    marks=("conf_00000.png", "frame_*.json"),
+    needs={
+        "frame_*.jpg": ("frame_*.jpg",),
+        "frame_*.json": ("frame_*.json",),
+        "depth_*.png": ("depth_*.png", "frame_*.exr"),
+    },
+)

@@ -22,31 +22,30 @@ import io
 import math
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from dsr.geometry.camera import Lens
 from dsr.geometry.poses import from_quaternion, invert
-from dsr.io.frames import CaptureFrame, Geometry, Record, file_state
+from dsr.io.captures.contract import Capture
+from dsr.io.frames import CaptureFrame, Geometry, Record, Size, Source, file_state, stated
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
-from dsr.utils.guards import decode_text, leads_outside, naming, natural_key, numbers_in, read_limited
+from dsr.utils.guards import decode_text, leads_outside, naming, natural_key, numbers_in, read_limited, refusing
 from dsr.utils.versions import hash_once
 
 _APP = "COLMAP"
-_PLACES = (".", "sparse/0", "sparse", "colmap/sparse/0")
-"""Where the model of a folder of photos may be."""
+_PLACES = (".", "sparse/0", "sparse", "colmap/sparse/0")  # of the model in a folder of photos
 _LARGEST = 1 << 30
 _LARGEST_SIDE = 1 << 15
-_NONE = 2**64 - 1
-"""The point of an observation that has none."""
-_FEWEST = 16
-"""Observed points of a photo from which they make a map."""
+_NONE = 2**64 - 1  # the point of an observation that has none
+_FEWEST = 16  # observed points of a photo from which they make a map
 _BROWN, _FISHEYE = ("brown_conrady", (4, 8)), ("kannala_brandt", (4,))
 
 
@@ -88,30 +87,11 @@ class _Image(NamedTuple):
     observed: np.ndarray
 
 
-@dataclass(frozen=True)
-class Model:
-    """A sparse model.
+class _Sparse(NamedTuple):
+    """A sparse model: its cameras, and its images in the order of their names."""
 
-    Args:
-        file: its file of images.
-        cameras, images: as they are stored; images in the order of their names.
-
-    """
-
-    file: Path
     cameras: Mapping[int, _Camera]
     images: Sequence[_Image]
-
-    def frame(self, image: _Image) -> CaptureFrame:
-        """Return the frame of an image, with camera and pose from the model."""
-        camera = self.cameras.get(image.camera)
-        if camera is None:
-            raise ValueError(
-                f"{self.file}: image {image.name!r:.80}: expected a camera of the model, got {image.camera}"
-            )
-        placed = (image.quaternion, image.translation, camera)
-        geometry = functools.partial(_geometry, f"{self.file}: image {image.name!r:.80}", *placed)
-        return CaptureFrame(_APP, geometry, self.file, repr(placed).encode())
 
 
 def model_file(place: Path) -> Path | None:
@@ -128,30 +108,34 @@ def _beside(file: Path, name: str) -> Path:
     return file.with_name(name + file.suffix)
 
 
-def read_model(file: Path) -> Model:
-    """Read a model.
+def _damaged(path: Path) -> AbstractContextManager[None]:
+    """Name a file that ends early."""
+    return refusing(f"{path}: expected a model of {_APP}, got a damaged or truncated file", struct.error)
 
-    Args:
-        file: ``images.bin`` or ``images.txt``, with the file of cameras beside it.
 
-    Raises:
-        ValueError: a file is damaged or foreign, or a camera has a model that is not known; the message names it.
-
-    """
+def _read_model(file: Path) -> _Sparse:
+    """Read a model, given its file of images, with that of cameras beside it."""
     path, binary = _beside(file, "cameras"), file.suffix == ".bin"
-    cameras = (_cameras_of_bytes if binary else _cameras_of_text)(path, read_limited(path, _LARGEST))
-    images = (_images_of_bytes if binary else _images_of_text)(file, read_limited(file, _LARGEST))
-    return Model(file, cameras, sorted(images, key=lambda image: natural_key(image.name)))
+    with _damaged(path):
+        cameras = (_cameras_of_bytes if binary else _cameras_of_text)(path, read_limited(path, _LARGEST))
+    with _damaged(file):
+        images = (_images_of_bytes if binary else _images_of_text)(file, read_limited(file, _LARGEST))
+    for image in images:
+        if image.camera not in cameras:
+            raise ValueError(f"{file}: image {image.name!r:.80}: expected a camera of the model, got {image.camera}")
+    return _Sparse(cameras, sorted(images, key=lambda image: natural_key(image.name)))
+
+
+def _frame(file: Path, image: _Image, camera: _Camera) -> CaptureFrame:
+    """Return the frame of an image, with camera and pose from the model."""
+    placed = (image.quaternion, image.translation, camera)
+    geometry = stated(lambda: _geometry(f"{file}: image {image.name!r:.80}", *placed))
+    return CaptureFrame(_APP, geometry, file, repr(placed).encode())
 
 
 def add_model(found: PairingResult, file: Path) -> PairingResult:
-    """Return pairs with the cameras and poses of a model; the same with a note if it has none of their photos.
-
-    Raises:
-        ValueError: see :func:`read_model`.
-
-    """
-    model = read_model(file)
+    """Return pairs with the cameras and poses of a model; the same with a note if it has none of their photos."""
+    model = _read_model(file)
     names = {image.name: image for image in model.images}
     stems = Counter(Path(image.name).stem for image in model.images)
     lone = {Path(name).stem: image for name, image in names.items() if stems[Path(name).stem] == 1}
@@ -164,11 +148,10 @@ def add_model(found: PairingResult, file: Path) -> PairingResult:
             pairs.append(pair)
             continue
         count += 1
-        frame = model.frame(image)
-        if pair.capture is not None:  # which has pictures, the depth camera and the time
-            geometry = functools.partial(_joined, frame.geometry, pair.capture.geometry)
-            content = frame.content + pair.capture.content
-            frame = replace(pair.capture, geometry=geometry, description=frame.description, content=content)
+        frame, own = _frame(file, image, model.cameras[image.camera]), pair.capture
+        if own is not None:  # which has pictures, and the depth camera
+            geometry = functools.partial(_joined, frame, own)
+            frame = replace(own, geometry=geometry, description=file, content=frame.content + own.content)
         pairs.append(replace(pair, capture=frame))
     if not count:
         text = f"no poses: {file.name} of {_APP} has {len(names)} images, none of these names"
@@ -176,15 +159,10 @@ def add_model(found: PairingResult, file: Path) -> PairingResult:
     return replace(found, pairs=tuple(pairs), assumptions=(*found.assumptions, _note(count, len(pairs), file)))
 
 
-def _joined(
-    model: Callable[[tuple[int, int]], Geometry], capture: Callable[[tuple[int, int]], Geometry], size: tuple[int, int]
-) -> Geometry:
-    """Return camera, pose and lens of a model, depth camera of a capture, or what is wrong with it."""
-    found = model(size)
-    try:
-        return found._replace(rig=capture(size).rig)
-    except ValueError as error:
-        return found._replace(damage=str(error))
+def _joined(model: CaptureFrame, capture: CaptureFrame, size: Size) -> Geometry:
+    """Return camera, pose and lens of a model, and the depth camera of a capture, or what is wrong with it."""
+    found, own = model.geometry_of(size), capture.geometry_of(size)
+    return found if found.damage else found._replace(rig=own.rig, damage=own.damage)
 
 
 def _note(count: int, total: int, file: Path) -> Assumption:
@@ -194,16 +172,11 @@ def _note(count: int, total: int, file: Path) -> Assumption:
 
 
 def find_colmap(folder: Path) -> PairingResult | None:
-    """Return the photos of a model in a folder without depth maps, with its points as depth; None if there is none.
-
-    Raises:
-        ValueError: see :func:`read_model`.
-
-    """
+    """Return the photos of a model in a folder without depth maps, with its points as depth; None if there is none."""
     file = model_file(folder)
     if file is None or not (points := _beside(file, "points3D")).is_file():
         return None
-    model, pairs, lone = read_model(file), [], []
+    model, pairs, lone = _read_model(file), [], []
     for image in model.images:
         places = (folder / part for part in ("images", ".", "rgb", "color") if not leads_outside(image.name))
         photo = next((place / image.name for place in places if (place / image.name).is_file()), None)
@@ -212,10 +185,9 @@ def find_colmap(folder: Path) -> PairingResult | None:
         if int((image.observed[:, 2] >= 0).sum()) < _FEWEST:
             lone.append(photo)
             continue
-        frame = model.frame(image)
-        source = SparseDepth(points, image, model.cameras[image.camera])
-        name = Path(image.name).with_suffix("").as_posix()
-        pairs.append(Pair(name, photo, points, unit=1.0, capture=replace(frame, depth=source)))
+        camera = model.cameras[image.camera]
+        frame = replace(_frame(file, image, camera), depth=_SparseDepth(points, image, camera))
+        pairs.append(Pair(Path(image.name).with_suffix("").as_posix(), photo, points, unit=1.0, capture=frame))
     if not pairs:
         return None
     note = Assumption(f"depth is that of the points of {points.name}, a coarse and sparse map")
@@ -223,16 +195,10 @@ def find_colmap(folder: Path) -> PairingResult | None:
 
 
 @dataclass(frozen=True, eq=False)
-class SparseDepth:
-    """A :class:`~dsr.io.frames.Source` of the depth of the points that an image shows.
+class _SparseDepth(Source):
+    """The depth of the points that an image shows, from the file of the points.
 
     The map has about a pixel for each of them; of several points in a pixel it has the nearest.
-
-    Args:
-        file: that of the points.
-        image: as it is stored.
-        camera: as it is stored.
-
     """
 
     file: Path
@@ -268,15 +234,10 @@ class SparseDepth:
 
     def record(self) -> Record:
         """Return a hash of the file of points, and the image's name."""
-        return {
-            "file": f"{self.file.name}/{self.image.name}",
-            "sha256": hash_once(self.file),
-        }
+        return {"file": f"{self.file.name}/{self.image.name}", "sha256": hash_once(self.file)}
 
 
-def _geometry(
-    place: str, quaternion: Sequence[float], translation: Sequence[float], camera: _Camera, _: tuple[int, int]
-) -> Geometry:
+def _geometry(place: str, quaternion: Sequence[float], translation: Sequence[float], camera: _Camera) -> Geometry:
     """Return camera, pose and lens of an image."""
     model, numbers = camera.model, camera.numbers
     fx, fy, (cx, cy) = numbers[0], numbers[model.focal - 1], numbers[model.focal : model.focal + 2]
@@ -299,40 +260,22 @@ def _pose(place: str, quaternion: Sequence[float], translation: Sequence[float])
 
 @dataclass
 class _Bytes:
-    """A binary file, read from its beginning; ``place`` is how far."""
+    """A binary file, read from its beginning; ``place`` is how far. A struct.error if it ends early."""
 
-    path: Path
     content: bytes
     place: int = 0
 
-    def read(self, layout: str) -> tuple[float, ...]:
-        """Return the next numbers of a layout of :mod:`struct`."""
-        layout = f"<{layout}"
-        self.expect(struct.calcsize(layout))
-        found = struct.unpack_from(layout, self.content, self.place)
-        self.place += struct.calcsize(layout)
+    def read(self, layout: str) -> tuple[Any, ...]:
+        """Return the next values of a layout of :mod:`struct`."""
+        found = struct.unpack_from(f"<{layout}", self.content, self.place)
+        self.place += struct.calcsize(f"<{layout}")
         return found
-
-    def count(self, least: int) -> int:
-        """Return the next number of records, of ``least`` bytes each."""
-        (count,) = self.read("Q")
-        self.expect(int(count) * least)
-        return int(count)
-
-    def expect(self, length: int) -> None:
-        """Raise ValueError unless as many bytes follow."""
-        if length > len(self.content) - self.place:
-            left = len(self.content) - self.place
-            raise ValueError(f"{self.path}: expected {length} bytes more of a model of {_APP}, got {left}")
 
     def text(self) -> str:
         """Return the next text, which ends with a 0."""
-        end = self.content.find(b"\0", self.place)
-        if end < 0:
-            raise ValueError(f"{self.path}: expected the name of an image, got no end of it")
-        found = self.content[self.place : end].decode("utf-8", "replace")
-        self.place = end + 1
-        return found
+        length = self.content.find(b"\0", self.place) - self.place
+        found, _ = self.read(f"{length}sc")
+        return str(found.decode("utf-8", "replace"))
 
 
 def _checked(
@@ -352,27 +295,26 @@ def _checked(
 
 def _cameras_of_bytes(path: Path, content: bytes) -> dict[int, _Camera]:
     """Return the cameras of ``cameras.bin`` by their numbers."""
-    file, cameras = _Bytes(path, content), {}
-    for _ in range(file.count(24)):
+    file, cameras = _Bytes(content), {}
+    for _ in range(*file.read("Q")):
         number, kind, width, height = file.read("iiQQ")
-        model = _MODELS.get(int(kind))
+        model = _MODELS.get(kind)
         numbers = () if model is None else file.read(f"{model.focal + 2 + model.bends}d")
-        cameras[int(number)] = _checked(path, model, kind, width, height, numbers)
+        cameras[number] = _checked(path, model, kind, width, height, numbers)
     return cameras
 
 
-def _images_of_bytes(path: Path, content: bytes) -> list[_Image]:
+def _images_of_bytes(_path: Path, content: bytes) -> list[_Image]:
     """Return the images of ``images.bin``."""
-    file, images = _Bytes(path, content), []
-    for _ in range(file.count(73)):
+    file, images = _Bytes(content), []
+    for _ in range(*file.read("Q")):
         _, *numbers, camera = file.read("I7dI")
-        name, count = file.text(), file.count(24)
-        kinds = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
-        stored = np.frombuffer(content, kinds, count, file.place)
-        file.place += 24 * count
+        name, (count,) = file.text(), file.read("Q")
+        (observations,) = file.read(f"{24 * count}s")
+        stored = np.frombuffer(observations, [("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
         points = np.where(stored["point"] == _NONE, -1.0, stored["point"].astype(np.float64))
         observed = np.stack((stored["x"], stored["y"], points), axis=1)
-        images.append(_Image(name, tuple(numbers[:4]), tuple(numbers[4:]), int(camera), observed))
+        images.append(_Image(name, tuple(numbers[:4]), tuple(numbers[4:]), camera, observed))
     return images
 
 
@@ -415,18 +357,17 @@ def _images_of_text(path: Path, content: bytes) -> list[_Image]:
 
 
 @functools.lru_cache(maxsize=1)
-def _points(path: Path, _: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def _points(path: Path, _state: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Return the numbers of the points of a file of a size and a time, (n,) float64 in order, and their places."""
     content, number = read_limited(path, _LARGEST), "<f8"
     stored = bytearray()  # number and place of each
     if path.suffix == ".bin":
-        number, file = "<u8", _Bytes(path, content)
-        for _number in range(file.count(51)):
-            file.expect(51)
-            stored += content[file.place : file.place + 32]
-            file.place += 43
-            length = 8 * file.count(8)
-            file.place += length
+        number, file = "<u8", _Bytes(content)
+        with _damaged(path):
+            for _number in range(*file.read("Q")):
+                stored += file.read("32s11x")[0]
+                (count,) = file.read("Q")
+                file.read(f"{8 * count}x")
     else:
         for line in filter(str.strip, _lines(content)):
             numbers = numbers_in(line.split()[:4])
@@ -436,3 +377,14 @@ def _points(path: Path, _: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     points = np.frombuffer(stored, [("number", number), ("place", "<f8", 3)])
     order = np.argsort(points["number"], kind="stable")
     return points["number"][order].astype(np.float64), points["place"][order]
+
+
+COLMAP = Capture(
+    _APP,
+    "a sparse model, in the folder of photos and depth maps, or of photos alone; or `--poses MODEL`",
+    "`sparse/0/`, `sparse/`, `colmap/sparse/0/` with `images.bin` or `images.txt`, or these beside the photos",
+    "intrinsics; distortion; poses; depth of the maps by its values, without maps of the model's points",
+    "written by pycolmap; models of two real scenes",
+    "",
+    "https://colmap.github.io/format.html",
+)

@@ -42,9 +42,11 @@ from pathlib import Path
 import numpy as np
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import Matrix, as_rigid
+from dsr.geometry.poses import as_rigid
 from dsr.io.cameras import read_camera
-from dsr.io.frames import CaptureFrame, Geometry
+from dsr.io.captures.contract import KINECT1, Capture
+from dsr.io.captures.scannet import read_sens
+from dsr.io.frames import CaptureFrame, Geometry, Size
 from dsr.io.images import read_numbers
 from dsr.io.pairs import (
     PHOTO_SUFFIXES,
@@ -56,6 +58,7 @@ from dsr.io.pairs import (
     list_pictures,
     match_pairs,
     numbered_files,
+    paired,
 )
 from dsr.io.photos import same_aspect
 from dsr.io.reading import SUNRGBD_BITS
@@ -64,25 +67,25 @@ from dsr.io.units import TURNED_BACK
 from dsr.notes import Assumption
 from dsr.utils.guards import natural_key, read_limited
 
-_LARGEST_TEXT = 1 << 16
-"""Largest file of a matrix in bytes."""
-_KINECT = 585.0, 585.0, 320.0, 240.0
-_KINECT_SIZE, _SCANNET_SIZE, _REPLICA_SIZE = (480, 640), (968, 1296), (680, 1200)
-_REPLICA_CAMERA, _REPLICA_UNIT = (600.0, 600.0, 599.5, 339.5), 1 / 6553.5
-_CameraOf = Callable[[tuple[int, int]], tuple[Camera | None, str]]
-"""Returns the camera of a photo of (height, width), and what was assumed for it."""
+_LARGEST_TEXT = 1 << 16  # bytes of a file of a matrix
+_KINECT = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
+_NICE_SLAM, _REPLICA_UNIT = Camera(1200, 680, 600.0, 600.0, 599.5, 339.5), 1 / 6553.5
+_SCANNET_SIZE = (968, 1296)
 _PARAMS = ("cam_params.json", "camera.json")
+_NO_POSE = Assumption("no pose: the capture has none of the frame")
+# Returns the camera of a photo of (height, width), and what was assumed for it.
+_CameraOf = Callable[[Size], tuple[Camera | None, str]]
 
 
-def find_seven_scenes(folder: Path) -> PairingResult | None:
-    """Return the frames of a sequence of 7-Scenes or 3DMatch; None if the folder is none."""
+def _find_seven_scenes(folder: Path) -> PairingResult | None:
+    """Return the frames of a sequence of 7-Scenes or 3DMatch."""
     if not has_name(folder, "", ".pose.txt"):
         return None
     poses, photos, depths = (
         {path.name.removesuffix(end): path for end in ends for path in folder.glob(f"*{end}")}
         for ends in ((".pose.txt",), (".color.jpg", ".color.png"), (".depth.png",))
     )
-    both = sorted(photos.keys() & depths.keys(), key=natural_key)
+    both, unpaired = paired({name: photos[name] for name in sorted(photos, key=natural_key)}, depths)
     if not both:
         return None
     camera = find_camera_file(folder, folder.parent)
@@ -90,36 +93,31 @@ def find_seven_scenes(folder: Path) -> PairingResult | None:
     for name in both:
         frame = _frame("7-Scenes", poses.get(name), folder / f"{name}.pose.txt", None if camera else _kinect)
         pairs.append(Pair(name, photos[name], depths[name], camera, unit=1e-3, capture=frame))
-    lone = [each[name] for each in (photos, depths) for name in sorted(each, key=natural_key) if name not in both]
     text = "a sequence of 7-Scenes or 3DMatch: depth in millimetres; from the folder: poses"
-    return PairingResult(tuple(pairs), (Assumption(text),), tuple(lone))
+    return PairingResult(tuple(pairs), (Assumption(text),), unpaired)
 
 
-def find_scannet(folder: Path) -> PairingResult | None:
-    """Return the frames of a folder of ScanNet's exports; None if it is none."""
+def _find_scannet(folder: Path) -> PairingResult | None:
+    """Return the frames of a folder of ScanNet's exports."""
     matrices = [folder / "intrinsic" / f"intrinsic_{kind}.txt" for kind in ("color", "depth")]
-    if not any(path.is_file() for path in matrices):
+    matrices = [path for path in matrices if path.is_file()]
+    photos, depths = numbered_files(folder / "color", PHOTO_SUFFIXES), numbered_files(folder / "depth", (".png",))
+    both, unpaired = paired(photos, depths)
+    if not matrices or not both:
         return None
-    photos, depths = (
-        numbered_files(folder / kind, suffixes) for kind, suffixes in (("color", PHOTO_SUFFIXES), ("depth", (".png",)))
-    )
-    both = sorted(photos.keys() & depths.keys())
-    if not both:
-        return None
-    camera = functools.partial(_scannet_camera, [path for path in matrices if path.is_file()])
-    described = b"".join(read_limited(path, _LARGEST_TEXT) for path in matrices if path.is_file())
+    camera = functools.partial(_scannet_camera, matrices)
+    described = b"".join(read_limited(path, _LARGEST_TEXT) for path in matrices)
     pairs = []
     for number in both:
         path = folder / "pose" / f"{photos[number].stem}.txt"
         frame = _frame("ScanNet", path if path.is_file() else None, path, camera, described)
         pairs.append(Pair(photos[number].stem, photos[number], depths[number], unit=1e-3, capture=frame))
-    lone = [each[number] for each in (photos, depths) for number in each if number not in both]
     note = describe_capture("an export of ScanNet", "millimetres", pairs, poses=(folder / "pose").is_dir())
-    return PairingResult(tuple(pairs), (note,), tuple(lone))
+    return PairingResult(tuple(pairs), (note,), unpaired)
 
 
-def find_sunrgbd(folder: Path) -> PairingResult | None:
-    """Return the pair of a scene of SUN RGB-D; None if the folder is none."""
+def _find_sunrgbd(folder: Path) -> PairingResult | None:
+    """Return the pair of a scene of SUN RGB-D."""
     matrix, kinds = folder / "intrinsics.txt", [folder / kind for kind in ("depth", "depth_bfx")]
     kinds = [path for path in kinds if path.is_dir() and has_pictures(path)]
     ours = matrix.is_file() and any((folder / name).is_dir() for name in ("depth_bfx", "extrinsics"))
@@ -131,12 +129,12 @@ def find_sunrgbd(folder: Path) -> PairingResult | None:
     return PairingResult(pairs, (Assumption(text),), found.unpaired) if pairs else None
 
 
-def find_replica(folder: Path) -> PairingResult | None:
-    """Return the frames of a scene of Replica as NICE-SLAM renders it; None if the folder is none."""
+def _find_replica(folder: Path) -> PairingResult | None:
+    """Return the frames of a scene of Replica as NICE-SLAM renders it."""
     photos = numbered_files(folder / "results", PHOTO_SUFFIXES, "frame")
     depths = numbered_files(folder / "results", (".png",), "depth")
-    trajectory, both = folder / "traj.txt", sorted(photos.keys() & depths.keys())
-    places = [place / name for place in (folder, folder.parent) for name in _PARAMS]
+    both, unpaired = paired(photos, depths)
+    trajectory, places = folder / "traj.txt", [place / name for place in (folder, folder.parent) for name in _PARAMS]
     params = next((path for path in places if path.is_file()), None)
     if not both or not (params or trajectory.is_file()):
         return None
@@ -147,14 +145,13 @@ def find_replica(folder: Path) -> PairingResult | None:
     pairs = []
     for number in both:
         pose = poses[ranks[number]] if ranks[number] < len(poses) else None
-        geometry = functools.partial(_replica, pose, known=params is not None)
-        frame = CaptureFrame("Replica", geometry, trajectory, repr(None if pose is None else pose.tolist()).encode())
-        files = photos[number], depths[number], params
-        pairs.append(Pair(photos[number].stem, *files, unit=unit, capture=frame))
-    lone = [each[number] for each in (photos, depths) for number in each if number not in both]
+        known = Geometry(None, pose, (_NO_POSE,) if pose is None else ())
+        described = repr(None if pose is None else pose.tolist()).encode()
+        frame = CaptureFrame("Replica", known if params else functools.partial(_replica, known), trajectory, described)
+        pairs.append(Pair(photos[number].stem, photos[number], depths[number], params, unit=unit, capture=frame))
     text = "a scene of Replica as NICE-SLAM renders it" + ("" if params else ": depth in 1/6553.5 m (--depth-unit)")
     note = Assumption(text + ("; from the folder: poses" if poses else ""))
-    return PairingResult(tuple(pairs), (note,), tuple(lone))
+    return PairingResult(tuple(pairs), (note,), unpaired)
 
 
 def _frame(
@@ -165,26 +162,25 @@ def _frame(
     return CaptureFrame(app, functools.partial(_geometry, path, camera), expected, described + content)
 
 
-def _geometry(path: Path | None, camera: _CameraOf | None, size: tuple[int, int]) -> Geometry:
+def _geometry(path: Path | None, camera: _CameraOf | None, size: Size) -> Geometry:
     """Return camera and pose of a frame."""
     found, text = (None, "") if camera is None else camera(size)
-    notes = [Assumption(text)] if text else []
+    notes = (Assumption(text),) if text else ()
     matrix = np.full((4, 4), np.nan) if path is None else read_numbers(path, 16).reshape(4, 4)
     if not np.isfinite(matrix).all():
-        notes.append(Assumption("no pose: the capture has none of the frame"))
-        return Geometry(found, None, tuple(notes))
-    return Geometry(found, as_rigid(matrix, str(path)), tuple(notes))
+        return Geometry(found, None, (*notes, _NO_POSE))
+    return Geometry(found, as_rigid(matrix, str(path)), notes)
 
 
-def _kinect(size: tuple[int, int]) -> tuple[Camera | None, str]:
+def _kinect(size: Size) -> tuple[Camera | None, str]:
     """Return the camera that 7-Scenes names, for photos of its aspect."""
-    if not same_aspect(size, _KINECT_SIZE):
+    if not same_aspect(size, (_KINECT.height, _KINECT.width)):
         return None, ""
     text = "camera: 585 pixels and the centre 320, 240 assumed, which 7-Scenes names; its Kinects are not calibrated"
-    return Camera(_KINECT_SIZE[1], _KINECT_SIZE[0], *_KINECT), f"{text} (--intrinsics)"
+    return _KINECT, f"{text} (--intrinsics)"
 
 
-def _scannet_camera(paths: list[Path], size: tuple[int, int]) -> tuple[Camera | None, str]:
+def _scannet_camera(paths: list[Path], size: Size) -> tuple[Camera, str]:
     """Return the camera of the first matrix that fits the photo, else of ScanNet's photos as they are recorded."""
     numbers = {}
     for path in paths:
@@ -206,11 +202,68 @@ def _unit(params: Path) -> float | None:
         return None
 
 
-def _replica(pose: Matrix | None, size: tuple[int, int], *, known: bool) -> Geometry:
-    """Return camera and pose of a rendering; the camera is None where a file is known to say it."""
-    notes = [] if pose is not None else [Assumption("no pose: the capture has none of the frame")]
-    if known or not same_aspect(size, _REPLICA_SIZE):
-        return Geometry(None, pose, tuple(notes))
+def _replica(found: Geometry, size: Size) -> Geometry:
+    """Return pose and camera of a rendering of which no file says the camera."""
+    if not same_aspect(size, (_NICE_SLAM.height, _NICE_SLAM.width)):
+        return found
     text = "camera: 600 pixels assumed, that of NICE-SLAM's renderings; there is no cam_params.json"
-    camera = Camera(_REPLICA_SIZE[1], _REPLICA_SIZE[0], *_REPLICA_CAMERA)
-    return Geometry(camera, pose, (Assumption(text), *notes))
+    return found._replace(camera=_NICE_SLAM, assumptions=(Assumption(text), *found.assumptions))
+
+
+SEVEN_SCENES = Capture(
+    "7-Scenes or 3DMatch",
+    "a sequence",
+    "`*.color.png` or `.jpg`, `*.depth.png`, `*.pose.txt`",
+    "depth in mm (16-bit PNG), 65535 in holes; `camera-intrinsics.txt`, else those of its page; poses",
+    "a real sequence of 1000 frames",
+    KINECT1,
+    "https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/",
+    _find_seven_scenes,
+    marks=("*.pose.txt",),
+    needs={"*.color.png": ("*.color.png", "*.color.jpg"), "*.depth.png": ("*.depth.png",)},
+)
+SCANNET = Capture(
+    "ScanNet",
+    "the `.sens` recording, or its export with SensReader",
+    "`*.sens`; `intrinsic/intrinsic_color.txt` with `color/` and `depth/`",
+    "depth in mm (zlib, raw, 16-bit PNG); intrinsics; poses, none where tracking was lost",
+    "written by its format",
+    KINECT1,
+    "https://github.com/ScanNet/ScanNet/blob/master/SensReader/python/SensorData.py",
+    _find_scannet,
+    read_sens,
+    (".sens",),
+    marks=("intrinsic/intrinsic_*.txt", "pose/*.txt"),
+    needs={
+        "color/": ("color/*",),
+        "depth/": ("depth/*.png",),
+        "intrinsic/intrinsic_color.txt": ("intrinsic/intrinsic_*.txt",),
+    },
+)
+SUNRGBD = Capture(
+    "SUN RGB-D",
+    "a scene in its own folders",
+    "`image/`, `depth/`, `intrinsics.txt`, and `depth_bfx/` or `extrinsics/`",
+    "depth in mm with turned bits; intrinsics",
+    "real frames of two sensors",
+    "Kinects, Xtion and RealSense",
+    "https://rgbd.cs.princeton.edu/",
+    _find_sunrgbd,
+    marks=("depth_bfx/*",),
+    needs={"image/": ("image/*",), "intrinsics.txt": ("intrinsics.txt",)},
+)
+REPLICA = Capture(
+    "Replica of NICE-SLAM",
+    "a rendered scene, or another program's in the same layout",
+    "`results/frame*.jpg`, `results/depth*.png`, and `traj.txt` or `cam_params.json`",
+    "depth in 1/`scale` m (1/6553.5); intrinsics (`cam_params.json`, here or one folder up); poses",
+    "written by its format",
+    "",
+    "https://github.com/cvg/nice-slam/blob/master/src/utils/datasets.py",
+    _find_replica,
+    marks=("results/depth*.png",),
+    needs={
+        "results/frame*.jpg": ("results/frame*",),
+        "traj.txt or cam_params.json": ("traj.txt", "cam_params.json"),
+    },
+)

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -24,39 +23,24 @@ from typing import Any, Literal
 import numpy as np
 
 from dsr.geometry.camera import Camera
-from dsr.io.frames import CaptureFrame, Geometry, Record
+from dsr.io.captures.contract import Capture
+from dsr.io.frames import CaptureFrame, Geometry, Record, Size, Source
 from dsr.io.pairs import Pair, PairingResult
 from dsr.io.photos import HEIC_SUFFIXES, decode_heic, open_heic, read_heic, same_aspect, turned_in_heic
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
-from dsr.utils.guards import MOST_FILE, MOST_TEXT, natural_key, numbers_in, opened, read_limited
+from dsr.utils.guards import MOST_FILE, MOST_TEXT, numbers_in, opened, read_limited
 from dsr.utils.versions import file_hash
 
-_APP = "HEIC"
-"""Not the device in the EXIF data: such depth is that of its two lenses or of a network, not of its depth sensor."""
-_HEAD = 1 << 20
-"""Bytes at the beginning of a file in which its images are listed."""
+_APP = "HEIC"  # not the device in the EXIF data: the depth is of its two lenses or a network, not of its depth sensor
+_HEAD = 1 << 20  # bytes at the beginning of a file in which its images are listed
 _MARK = re.compile(rb"urn:mpeg:hevc:2015:auxid:2|urn:mpeg:mpegB:cicp:systems:auxiliary:depth")
-_INVERSE_DEPTH, _DISPARITY, _DEPTH = 0, 1, 2
-"""Of HEVC's ``depth_representation_type``."""
-_TURNS: dict[int, Callable[[float, float, float, float, int, int], tuple[float, float, float, float]]] = {
-    1: lambda fx, fy, cx, cy, _, __: (fx, fy, cx, cy),
-    3: lambda fx, fy, cx, cy, width, height: (fx, fy, width - 1 - cx, height - 1 - cy),
-    6: lambda fx, fy, cx, cy, _, height: (fy, fx, height - 1 - cy, cx),
-    8: lambda fx, fy, cx, cy, width, _: (fy, fx, cy, width - 1 - cx),
-}
-"""Intrinsics of a turned picture, by EXIF orientation; mirrored ones are no photos of a camera."""
+_INVERSE_DEPTH, _DISPARITY, _DEPTH = 0, 1, 2  # of HEVC's depth_representation_type
 
 
 @dataclass(frozen=True)
-class HeicImage:
-    """A :class:`~dsr.io.frames.Source` of the photo or the depth map of a HEIC file.
-
-    Args:
-        file: the file.
-        role: which of both.
-
-    """
+class _HeicImage(Source):
+    """The photo or the depth map of a HEIC file."""
 
     file: Path
     role: Literal["photo", "depth"]
@@ -75,36 +59,18 @@ class HeicImage:
         return {"file": f"{self.file.name}/{self.role}", "sha256": file_hash(self.file)}
 
 
-def find_heic(place: Path) -> PairingResult | None:
-    """Return the pairs of a HEIC file, or of those in a folder; None if none has a depth map.
-
-    Raises:
-        ValueError: a file that is given has none, or pillow-heif is missing.
-
-    """
-    if place.is_file():
-        if place.suffix.lower() not in HEIC_SUFFIXES:
-            return None
-        if not _has_depth(place):
-            raise ValueError(f"{place}: expected a HEIC photo with a depth map, as of portrait mode; there is none")
-        found = [place]
-    else:
-        found = [path for path in place.iterdir() if path.suffix.lower() in HEIC_SUFFIXES and _has_depth(path)]
-    if not found:
-        return None
-    pairs = [
-        Pair(path.stem, path, path / "depth", unit=1.0, capture=CaptureFrame(
-            _APP, functools.partial(_geometry, path), path, _depth_xmp(path),
-            HeicImage(path, "photo"), HeicImage(path, "depth")))
-        for path in sorted(found, key=natural_key)
-    ]  # fmt: skip
-    return PairingResult(tuple(pairs), (Assumption("HEIC photos with depth maps of their own"),))
+def _read(path: Path) -> PairingResult:
+    """Return the pair of a HEIC file."""
+    if not _has_depth(path):
+        raise ValueError(f"{path}: expected a HEIC photo with a depth map, as of portrait mode; there is none")
+    sources = _HeicImage(path, "photo"), _HeicImage(path, "depth")
+    frame = CaptureFrame(_APP, functools.partial(_geometry, path), path, _depth_xmp(path), *sources)
+    pair = Pair(path.stem, path, path / "depth", unit=1.0, capture=frame)
+    return PairingResult((pair,), (Assumption("HEIC photos with depth maps of their own"),))
 
 
 def _has_depth(path: Path) -> bool:
     """Return whether a file lists a depth map."""
-    if not path.is_file():
-        return False
     with opened(path) as file:
         return _MARK.search(file.read(_HEAD)) is not None
 
@@ -134,7 +100,7 @@ def _depth_xmp(path: Path) -> bytes:
     return content[first:end] if place >= 0 and first >= 0 and end - first <= MOST_TEXT and end >= 0 else b""
 
 
-def _geometry(path: Path, size: tuple[int, int]) -> Geometry:
+def _geometry(path: Path, size: Size) -> Geometry:
     """Return the camera of a photo of (height, width)."""
     text = _depth_xmp(path).decode(errors="replace")
     accuracy = re.search(r"depthData:Accuracy\W{1,3}(\w+)", text)
@@ -146,7 +112,7 @@ def _geometry(path: Path, size: tuple[int, int]) -> Geometry:
     return Geometry(camera, None, tuple(notes))
 
 
-def _camera(path: Path, text: str, orientation: int, size: tuple[int, int]) -> Camera | None:
+def _camera(path: Path, text: str, orientation: int, size: Size) -> Camera | None:
     """Return the camera in the XMP text of the depth map; None if it has none."""
     matrix = re.search(r"depthData:IntrinsicMatrix>(.*?)</depthData:IntrinsicMatrix>", text, re.DOTALL)
     sides = dict(re.findall(r"depthData:IntrinsicMatrixReference(Width|Height)\W{1,3}(\d{1,6})\b", text))
@@ -156,11 +122,31 @@ def _camera(path: Path, text: str, orientation: int, size: tuple[int, int]) -> C
     width, height = int(sides["Width"]), int(sides["Height"])
     if len(values) != 9 or min(width, height) < 1:
         raise ValueError(f"{path}: depthData:IntrinsicMatrix: expected 9 numbers, got {matrix[1].strip()!r:.60}")
-    numbers = _TURNS.get(orientation, _TURNS[1])(values[0], values[4], values[6], values[7], width, height)
-    turned = (width, height) if orientation in (6, 8) else (height, width)
+    fx, _, _, _, fy, _, cx, cy, _ = values
+    if orientation in (3, 8):  # turned by a half, or to the left; mirrored pictures are no photos of a camera
+        cx = width - 1 - cx
+    if orientation in (3, 6):
+        cy = height - 1 - cy
+    turned = (height, width)
+    if orientation in (6, 8):
+        fx, fy, cx, cy, turned = fy, fx, cy, cx, (width, height)
     if not same_aspect(turned, size):
         raise ValueError(
             f"{path}: depthData:IntrinsicMatrix: expected the photo's aspect, got a camera of {turned[1]} x "
             f"{turned[0]} for {size[1]} x {size[0]} pixels (width x height)"
         )
-    return intrinsics_camera(f"{path}: depthData:IntrinsicMatrix", turned, numbers)
+    return intrinsics_camera(f"{path}: depthData:IntrinsicMatrix", turned, (fx, fy, cx, cy))
+
+
+HEIC = Capture(
+    "HEIC photos with depth",
+    "the unmodified `.heic`, as of iPhones in portrait mode; no JPEG of it",
+    "`*.heic`, `*.heif` with a depth map",
+    "depth in m or disparity in 1/m (8 bits), and whether it is relative; intrinsics (XMP, else EXIF); orientation",
+    "a real iPhone photo",
+    "256 steps; of two lenses or a network: guesses on blank walls, hair and glass, mostly no true distances",
+    "https://developer.apple.com/documentation/avfoundation/avdepthdata",
+    of_file=_read,
+    suffixes=HEIC_SUFFIXES,
+    is_ours=_has_depth,
+)

@@ -17,90 +17,70 @@ SDK, Rational6KT, has half of OpenCV's mixed tangential terms and is taken for i
 from __future__ import annotations
 
 import functools
-import hashlib
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import AliasPath, BaseModel, Field
 
 from dsr.geometry.camera import Camera, Lens
 from dsr.geometry.poses import as_rigid, invert
-from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo
-from dsr.io.frames import CaptureFrame, Geometry, Record, Rig, file_state
-from dsr.io.pairs import Pair, PairingResult, join, match_times
+from dsr.io.captures.archive import decode_photo
+from dsr.io.captures.contract import Capture, Shot, pair_by_time
+from dsr.io.frames import CaptureFrame, Geometry, Record, Rig, Size, Source, file_state, stated
+from dsr.io.pairs import PairingResult
 from dsr.io.trajectories import describe_capture, intrinsics_camera
-from dsr.utils.guards import expect_pixels, naming, natural_key, numbers_in, opened, refusing
+from dsr.utils.guards import expect_pixels, numbers_in, opened, refusing
 from dsr.utils.validation import Number, Whole, parse_model
 from dsr.utils.versions import how_to_install
 
 _APP = "Azure Kinect"
-_HEAD = 1 << 20
-"""Bytes at the beginning of a file in which its tags are."""
-_MARK = b"K4A_DEPTH_MODE"
-_COLOURS: dict[str, tuple[float, int]] = {
+_HEAD, _MARK = 1 << 20, b"K4A_DEPTH_MODE"  # bytes at the beginning of a file in which its tags are, and one of these
+# Bytes of each pixel, and OpenCV's conversion.
+_COLOURS = {
     "NV12": (1.5, cv2.COLOR_YUV2RGB_NV12),
     "YUY2": (2, cv2.COLOR_YUV2RGB_YUY2),
     "BGRA": (4, cv2.COLOR_BGRA2RGB),
 }
-"""Bytes of each pixel, and OpenCV's conversion."""
+# For each size of depth maps the size of the whole image, and what is cut off left and above.
 _DEPTH_MODES = {
     (288, 320): (512, 96, 90),
     (576, 640): (1024, 192, 180),
     (512, 512): (512, 0, 0),
     (1024, 1024): (1024, 0, 0),
 }
-"""For each size of depth maps the size of the whole image, and what is cut off left and above."""
 _LENS, _LENS_6KT = "CALIBRATION_LensDistortionModelBrownConrady", "CALIBRATION_LensDistortionModelRational6KT"
 _COLOUR_CAMERA, _DEPTH_CAMERA = "CALIBRATION_CameraLocationPV0", "CALIBRATION_CameraLocationD0"
 _DEPTH = "b16g"
 _LOCK = threading.Lock()
 
 
-class _Motion(BaseModel):
-    """Of the rig's frame to a camera's."""
-
-    Rotation: Annotated[list[Number], Field(min_length=9, max_length=9)]
-    Translation: Annotated[list[Number], Field(min_length=3, max_length=3)]
-
-
-class _Intrinsics(BaseModel):
-    """See the module's text."""
-
-    ModelType: str
-    ModelParameters: Annotated[list[Number], Field(min_length=14)]
-
-
 class _Camera(BaseModel):
-    """One of the cameras."""
+    """One of the cameras, and the motion from the rig's frame to its own; see the module's text."""
 
-    Location: str
-    Intrinsics: _Intrinsics
-    Rt: _Motion
-    SensorWidth: Annotated[Whole, Field(ge=1)]
-    SensorHeight: Annotated[Whole, Field(ge=1)]
-
-
-class _Cameras(BaseModel):
-    """What is read of the calibration."""
-
-    Cameras: list[_Camera]
+    location: str = Field(alias="Location")
+    kind: str = Field(validation_alias=AliasPath("Intrinsics", "ModelType"))
+    numbers: list[Number] = Field(validation_alias=AliasPath("Intrinsics", "ModelParameters"), min_length=14)
+    rotation: list[Number] = Field(validation_alias=AliasPath("Rt", "Rotation"), min_length=9, max_length=9)
+    translation: list[Number] = Field(validation_alias=AliasPath("Rt", "Translation"), min_length=3, max_length=3)
+    width: Whole = Field(alias="SensorWidth", ge=1)
+    height: Whole = Field(alias="SensorHeight", ge=1)
 
 
 class _Calibration(BaseModel):
     """The attachment."""
 
-    CalibrationInformation: _Cameras
+    cameras: list[_Camera] = Field(validation_alias=AliasPath("CalibrationInformation", "Cameras"))
 
 
 @dataclass(frozen=True)
-class Packet:
-    """A :class:`~dsr.io.frames.Source` of a frame of a recording.
+class _Packet(Source):
+    """A frame of a recording.
 
     Args:
         file: the recording.
@@ -108,46 +88,45 @@ class Packet:
         time: when it was taken, in the track's unit.
         size: (height, width).
         kind: ``b16g`` of depth, or the first letters of ``K4A_COLOR_MODE``.
-        seconds: when it was taken, or should have been, of a depth map that is late on purpose.
 
     """
 
     file: Path
     track: int
     time: int
-    size: tuple[int, int]
+    size: Size
     kind: str
-    seconds: float
 
-    def read(self) -> np.ndarray:
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        """What messages call it."""
+        return f"{self.kind} frame at {self.time}"
+
+    def decode(self, content: bytes) -> np.ndarray:
         """Return (H, W, 3) uint8 RGB of a photo, (h, w) uint16 of a depth map as it is stored."""
-        content, (height, width) = self._content(), self.size
-        with naming(f"{self.file}: {self.kind} frame at {self.time}"):
-            if self.kind == "MJPG":
-                if len(content) > PHOTO_LIMIT:
-                    raise ValueError(f"expected a photo of at most {PHOTO_LIMIT} bytes, got {len(content)}")
-                photo = decode_photo(content)
-                if photo.shape[:2] != self.size:
-                    got = f"{photo.shape[1]} x {photo.shape[0]}"
-                    raise ValueError(f"expected a photo of {width} x {height} pixels, got {got}")
-                return photo
-            each, code = _COLOURS.get(self.kind, (2, 0))
-            if len(content) != height * width * each:
-                raise ValueError(
-                    f"expected {width} x {height} pixels of {each:g} bytes, which are {height * width * each:g}, "
-                    f"got {len(content)} bytes"
-                )
-        if self.kind not in _COLOURS:
+        height, width = self.size
+        if self.kind == "MJPG":
+            photo = decode_photo(content)
+            if photo.shape[:2] != self.size:
+                got = f"{photo.shape[1]} x {photo.shape[0]}"
+                raise ValueError(f"expected a photo of {width} x {height} pixels, got {got}")
+            return photo
+        each, code = _COLOURS.get(self.kind, (2, 0))
+        if len(content) != height * width * each:
+            raise ValueError(
+                f"expected {width} x {height} pixels of {each:g} bytes, which are {height * width * each:g}, "
+                f"got {len(content)} bytes"
+            )
+        if self.kind == _DEPTH:
             return np.frombuffer(content, ">u2").reshape(self.size).astype(np.uint16)
         rows = (height * 3 // 2, width, 1) if self.kind == "NV12" else (height, width, int(each))
         return cv2.cvtColor(np.frombuffer(content, np.uint8).reshape(rows), code)
 
     def record(self) -> Record:
         """Return the recording's name, the track's and the time, and a hash of the frame."""
-        sha256 = hashlib.sha256(self._content()).hexdigest()
-        return {"file": f"{self.file.name}/{self.track}", "frame": self.time, "sha256": sha256}
+        return {**super().record(), "file": f"{self.file.name}/{self.track}", "frame": self.time}
 
-    def _content(self) -> bytes:
+    def content(self) -> bytes:
         """Return the frame as it is stored."""
         with _LOCK, _demuxing(self.file):
             container = _open(self.file, file_state(self.file, "a recording"))
@@ -159,75 +138,46 @@ class Packet:
         raise ValueError(f"{self.file}: expected a frame at {self.time} in track {self.track}, there is none any more")
 
 
-def find_kinect(place: Path) -> PairingResult | None:
-    """Return the frames of a recording, or of those in a folder; None if there is none.
-
-    Raises:
-        ValueError: a recording is damaged, or has no photos, no depth maps or no calibration; or PyAV is missing.
-
-    """
-    if place.is_file():
-        return _read(place) if place.suffix.lower() == ".mkv" else None
-    found = [path for path in place.iterdir() if path.suffix.lower() == ".mkv" and _is_ours(path)]
-    if not found:
-        return None
-    return join([_read(path, f"{path.stem}/") for path in sorted(found, key=natural_key)])
-
-
 def _is_ours(path: Path) -> bool:
     """Return whether a file is a recording of a Kinect, not another video."""
-    if not path.is_file():
-        return False
     with opened(path) as file:
         return _MARK in file.read(_HEAD)
 
 
-def _read(path: Path, prefix: str = "") -> PairingResult:
+def _read(path: Path) -> PairingResult:
     """Return the frames of a recording."""
     with _LOCK, _demuxing(path):
         container = _open(path, file_state(path, "a recording"))
-        times = _times(path, container)
-        attached = [each.data for each in container.streams.attachments if each.name == "calibration.json"]
+        photos, depths, sizes = _shots(path, container)
+        attached = [bytes(each.data) for each in container.streams.attachments if each.name == "calibration.json"]
     if not attached:
         raise ValueError(f"{path}: expected a recording with the attachment calibration.json, there is none")
-    photos, depths = ({path / role / f"{number:06}": packet for number, packet in enumerate(each)}
-                      for role, each in times.items())  # fmt: skip
-    partner = match_times(*({name: packet.seconds for name, packet in each.items()} for each in (photos, depths)))
-    if not partner:
-        raise ValueError(f"{path}: expected photos and depth maps within 20 ms of each other, found none")
-    size, size_lr = (next(iter(each.values())).size for each in (photos, depths))
-    geometry = functools.partial(_geometry, f"{path}: calibration.json", bytes(attached[0]), size, size_lr)
-    pairs = tuple(
-        Pair(f"{prefix}{photo.name}", photo, depth, unit=1e-3, capture=CaptureFrame(
-            _APP, geometry, path, bytes(attached[0]), photos[photo], depths[depth], photos[photo].seconds, apart=True))
-        for photo, depth in sorted(partner.items())
-    )  # fmt: skip
-    note = describe_capture(f"a recording of {_APP}", "millimetres", pairs, poses=False)
-    lone = [name for name in (*photos, *depths) if name not in {*partner, *partner.values()}]
-    return PairingResult(pairs, (note,), tuple(lone))
+    geometry = stated(lambda: _geometry(f"{path}: calibration.json", attached[0], *sizes))
+    found = pair_by_time(photos, depths, CaptureFrame(_APP, geometry, path, attached[0], apart=True), 1e-3)
+    note = describe_capture(f"a recording of {_APP}", "millimetres", found.pairs, poses=False)
+    return replace(found, assumptions=(note,))
 
 
-def _times(path: Path, container: Any) -> dict[str, list[Packet]]:
-    """Return the frames of both tracks in order; the depth maps' times are those that their photos should have."""
-    tracks = {role: _track(path, container, role) for role in ("color", "depth")}
-    kinds = {"color": tracks["color"].metadata.get("K4A_COLOR_MODE", "MJPG").partition("_")[0], "depth": _DEPTH}
-    if kinds["color"] not in ("MJPG", *_COLOURS):
-        raise ValueError(f"{path}: expected photos as MJPG, {', '.join(_COLOURS)}, got {kinds['color']:.40}")
+def _shots(path: Path, container: Any) -> tuple[list[Shot], list[Shot], tuple[Size, Size]]:
+    """Return photos and depth maps in order, with the times that both should have, and (height, width) of each."""
+    color, depth = (_track(path, container, role) for role in ("color", "depth"))
+    kind = color.metadata.get("K4A_COLOR_MODE", "MJPG").partition("_")[0]
+    if kind not in ("MJPG", *_COLOURS):
+        raise ValueError(f"{path}: expected photos as MJPG, {', '.join(_COLOURS)}, got {kind:.40}")
     text = container.metadata.get("K4A_DEPTH_DELAY_NS", "0")
     delay = numbers_in([text])
     if not delay:
         raise ValueError(f"{path}: K4A_DEPTH_DELAY_NS: expected a whole number, got {text:.40}")
-    late = {"color": 0.0, "depth": 1e-9 * delay[0]}
-    roles = {track.index: role for role, track in tracks.items()}
-    found: dict[str, list[Packet]] = {role: [] for role in tracks}
+    about = {color.index: ("color", color, kind, 0.0), depth.index: ("depth", depth, _DEPTH, 1e-9 * delay[0])}
+    shots: dict[str, list[Shot]] = {"color": [], "depth": []}
     container.seek(0)
-    for packet in container.demux(list(tracks.values())):
+    for packet in container.demux([color, depth]):
         if packet.pts is not None:
-            role = roles[packet.stream.index]
-            size = tracks[role].height, tracks[role].width
-            seconds = packet.pts * float(packet.time_base) - late[role]
-            found[role].append(Packet(path, packet.stream.index, packet.pts, size, kinds[role], seconds))
-    return found
+            role, track, stored, late = about[packet.stream.index]
+            source = _Packet(path, track.index, packet.pts, (track.height, track.width), stored)
+            seconds = packet.pts * float(packet.time_base) - late
+            shots[role].append(Shot(path / role / f"{len(shots[role]):06}", source, seconds))
+    return shots["color"], shots["depth"], ((color.height, color.width), (depth.height, depth.width))
 
 
 def _track(path: Path, container: Any, role: str) -> Any:
@@ -241,12 +191,10 @@ def _track(path: Path, container: Any, role: str) -> Any:
     raise ValueError(f"{path}: expected a recording of {_APP} with tracks COLOR and DEPTH, there is no {name}")
 
 
-def _geometry(
-    place: str, content: bytes, size: tuple[int, int], size_lr: tuple[int, int], _: tuple[int, int]
-) -> Geometry:
-    """Return the cameras of a recording."""
+def _geometry(place: str, content: bytes, size: Size, size_lr: Size) -> Geometry:
+    """Return the cameras of a recording with photos and depth maps of (height, width)."""
     calibration = parse_model(_Calibration, content.rstrip(b"\0"), place, f"expected the calibration of {_APP}; ")
-    cameras = {each.Location: each for each in calibration.CalibrationInformation.Cameras}
+    cameras = {each.location: each for each in calibration.cameras}
     for location in (_COLOUR_CAMERA, _DEPTH_CAMERA):
         if location not in cameras:
             raise ValueError(f"{place}: expected the camera {location}, there is none")
@@ -255,24 +203,22 @@ def _geometry(
         raise ValueError(f"{place}: expected depth maps of {sizes}, got {size_lr[1]} x {size_lr[0]}")
     photo, depth = cameras[_COLOUR_CAMERA], cameras[_DEPTH_CAMERA]
     width = size[1]
-    numbers = photo.Intrinsics.ModelParameters
-    if photo.SensorWidth * 9 == photo.SensorHeight * 16:  # of old devices: the middle three quarters of the image
+    numbers = photo.numbers
+    if photo.width * 9 == photo.height * 16:  # of old devices: the middle three quarters of the image
         numbers = [numbers[0], (numbers[1] * 0.75) + 0.125, numbers[2], numbers[3] * 0.75, *numbers[4:]]
     whole = (width * 3 // 4, width)
     camera = _scale(place, numbers, whole, (0, (whole[0] - size[0]) / 2), size)
     side, left, top = _DEPTH_MODES[size_lr]
-    own = _scale(place, depth.Intrinsics.ModelParameters, (side, side), (left, top), size_lr)
+    own = _scale(place, depth.numbers, (side, side), (left, top), size_lr)
     motions = []  # from the rig's frame to the cameras', (4, 4), metres
     for each in (depth, photo):
-        motion = np.column_stack((np.reshape(each.Rt.Rotation, (3, 3)), each.Rt.Translation))
-        motions.append(as_rigid(motion, f"{place}: Rt of {each.Location}"))
+        motion = np.column_stack((np.reshape(each.rotation, (3, 3)), each.translation))
+        motions.append(as_rigid(motion, f"{place}: Rt of {each.location}"))
     transform = motions[1] @ invert(motions[0])
     return Geometry(camera, lens=_lens(place, photo), rig=Rig(own, transform, _lens(place, depth)))
 
 
-def _scale(
-    place: str, numbers: Sequence[float], whole: tuple[int, int], cut: tuple[float, float], size: tuple[int, int]
-) -> Camera:
+def _scale(place: str, numbers: Sequence[float], whole: Size, cut: tuple[float, float], size: Size) -> Camera:
     """Return the camera of a part of an image.
 
     Args:
@@ -291,8 +237,8 @@ def _scale(
 
 def _lens(place: str, camera: _Camera) -> Lens:
     """Return the lens of a camera."""
-    kind = camera.Intrinsics.ModelType
-    k1, k2, k3, k4, k5, k6, codx, cody, p2, p1 = camera.Intrinsics.ModelParameters[4:14]
+    kind = camera.kind
+    k1, k2, k3, k4, k5, k6, codx, cody, p2, p1 = camera.numbers[4:14]
     if kind != _LENS and (kind != _LENS_6KT or codx or cody):  # with a centre of its own: of devices that were not sold
         centre = f"({codx:g}, {cody:g})"
         raise ValueError(f"{place}: expected a lens of {_LENS}, got {kind:.60} of the centre {centre}")
@@ -309,10 +255,25 @@ def _demuxing(path: Path) -> Iterator[None]:
 
 
 @functools.lru_cache(maxsize=1)
-def _open(path: Path, _: tuple[int, int]) -> Any:
+def _open(path: Path, _state: tuple[int, int]) -> Any:
     """Return the open recording; FFmpeg only takes it apart, and decodes nothing."""
     import av  # noqa: PLC0415 - an extra
 
     with opened(path) as file:
         file.read(1)  # or the error names the file, such as that of a link to a device
     return av.open(str(path), format="matroska", options={"codec_whitelist": "rawvideo", "analyzeduration": "0"})
+
+
+KINECT = Capture(
+    _APP,
+    "the `.mkv` of `k4arecorder`; of a Femto Bolt or Mega, that of Orbbec's K4A wrapper",
+    "`*.mkv` with its tracks `COLOR` and `DEPTH`",
+    "depth in mm (b16g), warped into the photo's view; photos as MJPEG, NV12, YUY2, BGRA; intrinsics, extrinsics and "
+    "distortion of both cameras (`calibration.json`), undone; time",
+    "written by its format; a real device's calibration gives its SDK's own numbers",
+    "flying pixels, noise on dark surfaces, rounded corners",
+    "https://github.com/microsoft/Azure-Kinect-Sensor-SDK/tree/develop/src/record",
+    of_file=_read,
+    suffixes=(".mkv",),
+    is_ours=_is_ours,
+)

@@ -17,8 +17,8 @@ that of colour after the inverse of that of depth. Frames are paired by their ti
 
 from __future__ import annotations
 
-import functools
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,9 +26,10 @@ import numpy as np
 
 from dsr.geometry.camera import Camera, Lens
 from dsr.geometry.poses import Matrix, as_rigid, from_quaternion, invert
-from dsr.io.captures.bags import Message, connections_of, deserialize, first_message, naming_recording
+from dsr.io.captures.bags import deserialize, first_message, images_of, messages_of, naming_recording
+from dsr.io.captures.contract import STEREO, Capture, Shot, pair_by_time
 from dsr.io.frames import CaptureFrame, Geometry, Rig
-from dsr.io.pairs import Pair, PairingResult, match_times
+from dsr.io.pairs import PairingResult
 from dsr.io.trajectories import describe_capture, intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import naming, numbers_in
@@ -40,15 +41,14 @@ _IMAGES = re.compile(
     r"(?P<stream>(?P<sensor>/device_\d+/sensor_\d+)/(?P<kind>\w+)_\d+)/image/data(/compressed(Depth)?)?"
 )
 _USUAL_UNIT = 1e-3
-_ALIKE = 1e-5
-"""Difference of numbers of two cameras, and of a transform to none, up to which they are the same."""
+_ALIKE = 1e-5  # difference of numbers of two cameras, and of a transform to none, up to which they are the same
+# The SDK's names of distortion models (rs2_distortion_to_string), in lower case.
 _LENSES = {
     "brown conrady": "brown_conrady",
     "modified brown conrady": "modified_brown_conrady",
     "inverse brown conrady": "modified_brown_conrady",
     "kannala brandt4": "kannala_brandt",
 }
-"""The SDK's names of distortion models (``rs2_distortion_to_string``), in lower case."""
 
 
 class _Stream(NamedTuple):
@@ -61,77 +61,44 @@ class _Stream(NamedTuple):
     notes: tuple[Assumption, ...]
 
 
-def read(reader: Any, path: Path, prefix: str) -> PairingResult:
-    """Return the frames of a recording.
-
-    Args:
-        reader: the open recording.
-        path: its file.
-        prefix: of the frames' names.
-
-    Raises:
-        ValueError: it has no colour or no depth, or what describes them is missing or damaged.
-
-    """
+def read(reader: Any, path: Path) -> PairingResult:
+    """Return the frames of an open recording."""
     version = int(first_message(reader, VERSION).data)
     if version < _OLDEST:
         raise ValueError(f"{path}: expected file_version {_OLDEST} or later of RealSense's SDK, got {version}")
-    color_topic, depth_topic = (_choose(reader, path, kind) for kind in ("Color", "Depth"))
-    unit, notes = _unit(reader, path, depth_topic)
-    streams, registered, damage = None, list[Assumption](), ""
+    topics = {each.topic: match for each in reader.connections if (match := _IMAGES.fullmatch(each.topic))}
+    color, depth = (_choose(reader, path, topics, kind) for kind in ("Color", "Depth"))
+    unit, notes = _unit(reader, path, depth["sensor"])
+    streams, registered = None, list[Assumption]()
     try:
         with naming_recording(path):
-            streams = _stream(reader, path, color_topic), _stream(reader, path, depth_topic)
+            streams = _stream(reader, path, color["stream"]), _stream(reader, path, depth["stream"])
             geometry, registered = _geometry(*streams)
     except ValueError as error:  # which does not matter where cameras are given
-        geometry, damage = Geometry(), str(error)
-    photos, depths = (_frames(reader, path, topic) for topic in (color_topic, depth_topic))
-    partner = match_times(
-        {Path(f"{i:09}"): stamp for i, (_, stamp) in enumerate(photos)},
-        {Path(f"{i:09}"): stamp for i, (_, stamp) in enumerate(depths)},
-    )
-    if not partner:
-        raise ValueError(f"{path}: expected photos and depth maps within 20 ms of each other, found none")
+        geometry = Geometry(damage=str(error))
     device = _device(reader)
-    described = repr(streams or damage).encode()
-    apart = all(_transforms(reader, _part(topic, "stream")) for topic in (color_topic, depth_topic))
-    places = Path(f"{path}{color_topic}"), Path(f"{path}{depth_topic}")
-    pairs = []
-    for first, second in sorted(partner.items()):
-        sources = photos[int(first.name)][0], depths[int(second.name)][0]
-        own = functools.partial(_of_photo, geometry, damage)
-        frame = CaptureFrame(device, own, path, described, *sources, time=photos[int(first.name)][1], apart=apart)
-        pairs.append(Pair(f"{prefix}{int(first.name):06}", *places, unit=unit, capture=frame))
-    about = describe_capture(f"a recording of {device}", f"units of {show_length(unit)}", pairs, poses=False)
-    others = sorted(
-        {each.topic for each in reader.connections if _IMAGES.fullmatch(each.topic)} - {color_topic, depth_topic}
-    )
+    apart = all(_transforms(reader, each["stream"]) for each in (color, depth))
+    frame = CaptureFrame(device, geometry, path, repr(streams or geometry.damage).encode(), apart=apart)
+    found = pair_by_time(_shots(reader, path, color), _shots(reader, path, depth), frame, unit)
+    about = describe_capture(f"a recording of {device}", f"units of {show_length(unit)}", found.pairs, poses=False)
+    others = sorted(topics.keys() - {color[0], depth[0]})
     if others:
         notes.append(Assumption(f"topics that are not read: {', '.join(others)}"))
-    lone = [places[0]] * (len(photos) - len(pairs)) + [places[1]] * (len(depths) - len(pairs))
-    return PairingResult(tuple(pairs), (about, *registered, *notes), tuple(lone))
+    return replace(found, assumptions=(about, *registered, *notes))
 
 
-def _choose(reader: Any, path: Path, kind: str) -> str:
+def _choose(reader: Any, path: Path, topics: dict[str, re.Match[str]], kind: str) -> re.Match[str]:
     """Return the topic of the images of the stream of a kind that has the most, the first by name of several."""
-    topics = {each.topic: each.msgcount for each in reader.connections
-              if (match := _IMAGES.fullmatch(each.topic)) and match["kind"] == kind and each.msgcount}  # fmt: skip
-    if not topics:
-        found = sorted({match["kind"] for each in reader.connections if (match := _IMAGES.fullmatch(each.topic))})
-        raise ValueError(f"{path}: expected a stream {kind} of RealSense's SDK, got {', '.join(found) or 'no images'}")
-    return min(topics, key=lambda topic: (-topics[topic], topic))
+    counts = {each.topic: each.msgcount for each in reader.connections
+              if each.topic in topics and topics[each.topic]["kind"] == kind and each.msgcount}  # fmt: skip
+    if not counts:
+        found = ", ".join(sorted({match["kind"] for match in topics.values()})) or "no images"
+        raise ValueError(f"{path}: expected a stream {kind} of RealSense's SDK, got {found}")
+    return topics[min(counts, key=lambda topic: (-counts[topic], topic))]
 
 
-def _part(topic: str, group: str) -> str:
-    """Return a part of the topic of a stream's images: ``stream`` or ``sensor``."""
-    match = _IMAGES.fullmatch(topic)
-    assert match is not None  # noqa: S101 - chosen by it
-    return match[group]
-
-
-def _stream(reader: Any, path: Path, topic: str) -> _Stream:
+def _stream(reader: Any, path: Path, stream: str) -> _Stream:
     """Return the camera of a stream."""
-    stream = _part(topic, "stream")
     place = f"{path}{stream}"
     info = first_message(reader, f"{stream}/info/camera_info")
     if info is not None:
@@ -150,14 +117,12 @@ def _stream(reader: Any, path: Path, topic: str) -> _Stream:
     if min(size) < 1:
         raise ValueError(f"{place}: expected a positive width and height, got {size[1]} x {size[0]}")
     camera = intrinsics_camera(place, size, [float(number) for number in numbers])
-    lens: Lens | None = None
-    notes: tuple[Assumption, ...] = ()
+    lens, notes = None, tuple[Assumption, ...]()
     if np.any(distortion):
         name = _LENSES.get(model.strip().lower())
         if name is None:
-            notes = (
-                Assumption(f"the lens distortion of {stream} is not undone: its model {model!r:.40} is not known"),
-            )
+            text = f"the lens distortion of {stream} is not undone: its model {model!r:.40} is not known"
+            notes = (Assumption(text),)
         else:
             with naming(place):
                 lens = Lens(name, tuple(map(float, distortion))[: 4 if name == "kannala_brandt" else None])
@@ -210,58 +175,54 @@ def _geometry(color: _Stream, depth: _Stream) -> tuple[Geometry, list[Assumption
     return geometry._replace(rig=Rig(depth.camera, transform, depth.lens)), []
 
 
-def _of_photo(geometry: Geometry, damage: str, _: tuple[int, int]) -> Geometry:
-    """Return the cameras, which are those of photos of all sizes; ValueError if they are damaged."""
-    if damage:
-        raise ValueError(damage)
-    return geometry
-
-
-def _unit(reader: Any, path: Path, topic: str) -> tuple[float, list[Assumption]]:
+def _unit(reader: Any, path: Path, sensor: str) -> tuple[float, list[Assumption]]:
     """Return metres per value of the depth stream, and an assumption if it is not stated."""
-    sensor = _part(topic, "sensor")
     message = first_message(reader, f"{sensor}/option/Depth_Units/value")
     if message is not None:
         unit = numbers_in([str(message.data)])
         if not unit or not 0 < unit[0] < 1:
             raise ValueError(f"{path}{sensor}: expected Depth_Units in metres, got {message.data!s:.40}")
         return float(f"{unit[0]:.6g}"), []  # float32: 0.001 is 0.0010000000475
-    properties = connections_of(reader, f"{sensor}/property")
-    for connection, _, raw in reader.messages(properties) if properties else ():
-        found = deserialize(reader, raw, connection.msgtype)
+    for _, found in messages_of(reader, f"{sensor}/property"):
         unit = numbers_in([found.value])
         if found.key.replace("_", " ") == "Depth Units" and unit and 0 < unit[0] < 1:
             return unit[0], []
     return _USUAL_UNIT, [Assumption("the recording does not state Depth Units: millimetres assumed (--depth-unit)")]
 
 
-def _frames(reader: Any, path: Path, topic: str) -> list[tuple[Message, float]]:
-    """Return the images of a stream with the time stamps of their frames in seconds, in the order of these."""
+def _shots(reader: Any, path: Path, topic: re.Match[str]) -> list[Shot]:
+    """Return the images of a stream in the order of the time stamps of their frames."""
     stamps = {}
-    described = connections_of(reader, f"{_part(topic, 'stream')}/image/metadata")
-    for connection, time, raw in reader.messages(described) if reader.is2 and described else ():
-        entries = _entries(deserialize(reader, raw, connection.msgtype), "")
-        stamps[time] = numbers_in([entries.get("timestamp", "")])
-    found: list[tuple[Message, float]] = []
-    for connection, time, raw in reader.messages(connections_of(reader, topic)):
-        same = found[-1][0].order + 1 if found and found[-1][0].time == time else 0
+    for time, message in messages_of(reader, f"{topic['stream']}/image/metadata") if reader.is2 else ():
+        stamps[time] = numbers_in([_entries(message, "").get("timestamp", "")])
+    shots = []
+    for message, raw in images_of(reader, path, topic[0]):
         if reader.is2:
-            stamp = 1e-3 * (stamps.get(time) or [1e-6 * time])[0]
+            stamp = 1e-3 * (stamps.get(message.time) or [1e-6 * message.time])[0]
         else:
-            header = deserialize(reader, raw, connection.msgtype).header.stamp
+            header = deserialize(reader, raw, message.kind).header.stamp
             stamp = header.sec + 1e-9 * header.nanosec
-        found.append((Message(path, topic, time, same), stamp))
-    return sorted(found, key=lambda each: each[1])
+        shots.append(Shot(Path(f"{path}{topic[0]}"), message, stamp))
+    return sorted(shots, key=lambda shot: shot.seconds)
 
 
 def _device(reader: Any) -> str:
     """Return the name of the device, as it is recorded."""
-    connections = connections_of(reader, "/device_0/info")
-    for connection, _, raw in reader.messages(connections) if connections else ():
-        message = deserialize(reader, raw, connection.msgtype)
+    for _, message in messages_of(reader, "/device_0/info"):
         name = message.value if getattr(message, "key", "") == "Name" else ""
         if hasattr(message, "data"):
             name = _entries(message, "").get("Name", "")
         if name:
             return str(name)
     return "RealSense"
+
+
+REALSENSE = Capture(
+    "RealSense SDK",
+    "record in RealSense Viewer, or `enable_record_to_file`, with depth and colour",
+    "`*.bag` (SDK up to 2.57), `*.db3` (since)",
+    "depth in the unit of `Depth_Units`, warped to the photo; both intrinsics, extrinsics and distortions; time",
+    "two recordings that SDK 2.55 and 2.59 wrote",
+    STEREO,
+    "https://github.com/IntelRealSense/librealsense/blob/master/src/media/ros/ros_file_format.h",
+)  # which dsr.io.captures.ros opens

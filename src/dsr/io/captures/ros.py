@@ -17,11 +17,11 @@ Recordings of RealSense's SDK are those of :mod:`dsr.io.captures.realsense`.
 from __future__ import annotations
 
 import contextlib
-import functools
 import itertools
 import re
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -33,98 +33,71 @@ from dsr.io.captures import realsense
 from dsr.io.captures.bags import (
     COMPRESSED,
     IMAGE,
-    Message,
     connections_of,
     first_message,
+    images_of,
     naming_recording,
     open_recording,
 )
+from dsr.io.captures.contract import Capture, Shot, pair_by_time
 from dsr.io.captures.ros_images import COLOURS, DEPTHS
-from dsr.io.frames import CaptureFrame, Geometry, Rig
-from dsr.io.pairs import Pair, PairingResult, is_registered, join, match_times
+from dsr.io.frames import CaptureFrame, Geometry, Rig, stated
+from dsr.io.pairs import PairingResult, is_registered
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
-from dsr.utils.guards import naming, natural_key
+from dsr.utils.guards import naming
 
-FILES = (".bag", ".mcap", ".db3")
-"""Suffixes of recordings that are a single file."""
-_FILES_2 = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
-"""Those beside ``metadata.yaml``."""
-_UNITS = {"u": 1e-3, "f": 1.0}
+_BESIDE_METADATA = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 _COLOUR_NAMES = ("color", "colour", "rgb")
-_ALIKE = 2e-3
-"""Difference of focal lengths and centres, over the picture's size, up to which two cameras are the same."""
-_AT_ONE_PLACE = 1e-3
-"""Metres between two cameras, and entries of the rotation, up to which they are at one place."""
-_MOST_TRANSFORMS = 10_000
-"""Largest number of messages that are searched for a transform."""
+_ALIKE = 2e-3  # difference of focal lengths and centres, over the picture's size, of cameras that are the same
+_AT_ONE_PLACE = 1e-3  # metres between two cameras, and entries of the rotation, of cameras at one place
+_MOST_TRANSFORMS = 10_000  # messages that are searched for a transform
 _EXTRINSICS = re.compile(r"(.*/)extrinsics/(\w+)_to_(\w+)")
-
-_LENSES = {
-    "plumb_bob": "brown_conrady",
-    "rational_polynomial": "brown_conrady",
-    "equidistant": "kannala_brandt",
-}
-"""Distortion models of CameraInfo, see sensor_msgs/distortion_models.h."""
+# Distortion models of CameraInfo, see sensor_msgs/distortion_models.h.
+_LENSES = {"plumb_bob": "brown_conrady", "rational_polynomial": "brown_conrady", "equidistant": "kannala_brandt"}
 
 
-def find_ros(folder: Path) -> PairingResult | None:
-    """Return the frames of a recording, or of those in a folder; None if there is none.
-
-    Raises:
-        ValueError: a recording is damaged, or has no topic of photos or of depth; or rosbags is missing.
-
-    """
-    if folder.is_file():
-        return _read(folder) if folder.suffix.lower() in FILES else None
-    if (folder / "metadata.yaml").is_file() and any(any(folder.glob(f"*{suffix}")) for suffix in _FILES_2):
-        return _read(folder)
-    bags = [path for path in folder.iterdir() if path.suffix.lower() in FILES and path.is_file()]
-    if not bags:
-        return None
-    return join([_read(path, f"{path.stem}/") for path in sorted(bags, key=natural_key)])
+def _find(folder: Path) -> PairingResult | None:
+    """Return the frames of a recording of ROS 2 that is a folder."""
+    there = (folder / "metadata.yaml").is_file() and any(any(folder.glob(f"*{each}")) for each in _BESIDE_METADATA)
+    return _read(folder) if there else None
 
 
-def _read(path: Path, prefix: str = "") -> PairingResult:
+def _read(path: Path) -> PairingResult:
     """Return the frames of a recording."""
     with naming_recording(path):
         reader = open_recording(path)
         if connections_of(reader, realsense.VERSION):
-            return realsense.read(reader, path, prefix)
+            return realsense.read(reader, path)
         topics = _topics(reader)
-        photo_topic, depth_topic = _choose(path, topics)
-        photos, depths = (_times(reader, path, each.name) for each in (photo_topic, depth_topic))
-        kind = depths[0][0].read().dtype.kind
-        same = _have_same_frame(photo_topic, depth_topic)
-        motion = np.eye(4) if same else _transform(reader, photo_topic, depth_topic)
-        registered = _are_registered(photo_topic, depth_topic)
-        if motion is not None and not is_registered(depth_topic.name):
-            registered = registered and np.allclose(motion, np.eye(4), rtol=0, atol=_AT_ONE_PLACE)
-    named = {kind: {Path(f"{i:09}"): stamp for i, (_, stamp) in enumerate(each)} for kind, each in
-             (("rgb", photos), ("depth", depths))}  # fmt: skip
-    partner = match_times(named["rgb"], named["depth"])
-    if not partner:
-        raise ValueError(f"{path}: expected photos and depth maps within 20 ms of each other, found none")
-    described = repr(photo_topic.info if registered else (photo_topic, depth_topic, motion)).encode()
-    geometry = functools.partial(_camera, path, photo_topic)
-    if not registered:
-        geometry = functools.partial(_apart, path, photo_topic, depth_topic, motion)
-    elif not same:
-        geometry = functools.partial(_counted, geometry, photo_topic, depth_topic)
-    places = Path(f"{path}{photo_topic.name}"), Path(f"{path}{depth_topic.name}")
-    pairs = []
-    for first, second in sorted(partner.items()):
-        photo, depth = photos[int(first.name)][0], depths[int(second.name)][0]
-        time = named["rgb"][first]
-        frame = CaptureFrame("ROS", geometry, path, described, photo, depth, time, apart=not registered)
-        pairs.append(Pair(f"{prefix}{int(first.name):06}", *places, unit=_UNITS[kind], capture=frame))
-    unit = "millimetres" if kind == "u" else "metres"
-    notes = [Assumption(f"a recording of ROS: photos of {photo_topic.name}, depth in {unit} of {depth_topic.name}")]
-    others = [each.name for each in topics if each.role and each not in (photo_topic, depth_topic)]
+        photo, depth = _choose(path, topics)
+        photos, depths = (_shots(reader, path, each.name) for each in (photo, depth))
+        in_metres = depths[0].source.read().dtype.kind == "f"
+        same = _have_same_frame(photo, depth)
+        motion = np.eye(4) if same else _transform(reader, photo, depth)
+    registered = _are_registered(photo, depth)
+    if motion is not None and not is_registered(depth.name):
+        registered = registered and np.allclose(motion, np.eye(4), rtol=0, atol=_AT_ONE_PLACE)
+
+    def geometry() -> Geometry:
+        if not registered:
+            return _apart(path, photo, depth, motion)
+        found = _camera(path, photo)
+        if same:
+            return found
+        text = f"depth of the frame {depth.frame!r} counts as registered to photos of {photo.frame!r}"
+        code = "" if is_registered(depth.name) else "other-frame"
+        return found._replace(assumptions=(*found.assumptions, Assumption(text, "", code, 1.0 if code else None)))
+
+    described = repr(photo.info if registered else (photo, depth, motion)).encode()
+    frame = CaptureFrame("ROS", stated(geometry), path, described, apart=not registered)
+    found = pair_by_time(photos, depths, frame, 1.0 if in_metres else 1e-3)
+    unit = "metres" if in_metres else "millimetres"
+    notes = [Assumption(f"a recording of ROS: photos of {photo.name}, depth in {unit} of {depth.name}")]
+    others = [each.name for each in topics if each.role and each not in (photo, depth)]
     if others:
         notes.append(Assumption(f"topics that are not read: {', '.join(others)}"))
-    lone = [places[0]] * (len(photos) - len(pairs)) + [places[1]] * (len(depths) - len(pairs))
-    return PairingResult(tuple(pairs), tuple(notes), tuple(lone))
+    return replace(found, assumptions=tuple(notes))
 
 
 class _Topic(NamedTuple):
@@ -182,15 +155,14 @@ def _choose(path: Path, topics: Sequence[_Topic]) -> tuple[_Topic, _Topic]:
     return min(itertools.product(photos, depths), key=order)
 
 
-def _times(reader: Any, path: Path, topic: str) -> list[tuple[Message, float]]:
-    """Return the messages of a topic with the times in their headers, in seconds."""
-    found: list[tuple[Message, float]] = []
-    for connection, time, raw in reader.messages(connections_of(reader, topic)):
-        same = found[-1][0].order + 1 if found and found[-1][0].time == time else 0
+def _shots(reader: Any, path: Path, topic: str) -> list[Shot]:
+    """Return the images of a topic with the times in their headers."""
+    shots = []
+    for message, raw in images_of(reader, path, topic):
         seconds, nanoseconds = struct.unpack_from("<II", raw, 4)  # after a sequence number, or CDR's header
-        stamp = seconds + 1e-9 * nanoseconds if seconds else 1e-9 * time
-        found.append((Message(path, connection.topic, time, same), stamp))
-    return found
+        stamp = seconds + 1e-9 * nanoseconds if seconds else 1e-9 * message.time
+        shots.append(Shot(Path(f"{path}{topic}"), message, stamp))
+    return shots
 
 
 def _are_registered(photo: _Topic, depth: _Topic) -> bool:
@@ -198,7 +170,7 @@ def _are_registered(photo: _Topic, depth: _Topic) -> bool:
     views = []
     for topic in (photo, depth):
         with contextlib.suppress(ValueError):  # which is reported where the camera is needed
-            if (camera := _camera(Path(), topic, (0, 0)).camera) is not None:
+            if (camera := _camera(Path(), topic).camera) is not None:
                 unit = camera.rescale(1, 1)
                 views.append((unit.fx, unit.fy, unit.cx, unit.cy))
     if len(views) == 2:
@@ -283,22 +255,10 @@ def _camera_info(reader: Any, topic: str, role: str) -> _Info | None:
     return None
 
 
-def _counted(
-    geometry: Callable[[tuple[int, int]], Geometry], photo: _Topic, depth: _Topic, size: tuple[int, int]
-) -> Geometry:
-    """Return the camera of a recording whose depth counts as registered though it has another frame."""
-    found, text = (
-        geometry(size),
-        f"depth of the frame {depth.frame!r} counts as registered to photos of {photo.frame!r}",
-    )
-    code = "" if is_registered(depth.name) else "other-frame"
-    return found._replace(assumptions=(*found.assumptions, Assumption(text, "", code, 1.0 if code else None)))
-
-
-def _apart(path: Path, photo: _Topic, depth: _Topic, motion: Matrix | None, size: tuple[int, int]) -> Geometry:
+def _apart(path: Path, photo: _Topic, depth: _Topic, motion: Matrix | None) -> Geometry:
     """Return the cameras of a recording whose depth is not in the photo's pixels."""
-    found = _camera(path, photo, size)
-    own = Geometry() if motion is None else _camera(path, depth, size)
+    found = _camera(path, photo)
+    own = Geometry() if motion is None else _camera(path, depth)
     if motion is None or own.camera is None:
         missing = "transform between them (tf_static, extrinsics)" if motion is None else "camera_info of the depth"
         text = (
@@ -311,7 +271,7 @@ def _apart(path: Path, photo: _Topic, depth: _Topic, motion: Matrix | None, size
     return found._replace(rig=rig, assumptions=(*found.assumptions, *own.assumptions))
 
 
-def _camera(path: Path, topic: _Topic, _: tuple[int, int]) -> Geometry:
+def _camera(path: Path, topic: _Topic) -> Geometry:
     """Return the camera and the lens of a topic."""
     info, what = topic.info, "photo" if topic.role == "rgb" else "depth map"
     place = f"{path}{PurePosixPath(topic.name).parent / 'camera_info'}"
@@ -337,3 +297,17 @@ def _camera(path: Path, topic: _Topic, _: tuple[int, int]) -> Geometry:
         return Geometry(camera)
     text = f"the {what}'s lens distortion is not undone: its model {info.model!r:.40} is not known"
     return Geometry(camera, None, (Assumption(text),))
+
+
+ROS = Capture(
+    "ROS 1 and 2",
+    "`rosbag record`, `ros2 bag record` of a colour and a depth topic with their `camera_info`",
+    "`*.bag`, `*.mcap`, `*.db3`; a folder of them, or of `*.zstd`, with `metadata.yaml`",
+    "depth in mm (16UC1), m (32FC1), compressedDepth (PNG, RVL), warped by `/tf_static`; `camera_info`; time",
+    "written by rosbags",
+    "",
+    "https://docs.ros.org/en/api/sensor_msgs/html/index-msg.html",
+    _find,
+    _read,
+    (".bag", ".mcap", ".db3"),
+)

@@ -12,10 +12,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo
+from dsr.io.captures.archive import decode_photo
 from dsr.utils.decoding import decode_pixels
-from dsr.utils.guards import expect_pixels, naming, pixels_of_file
+from dsr.utils.guards import expect_pixels, pixels_of_file
 
+# Channels of encodings of colour, and OpenCV's conversion to BGR.
 COLOURS = {
     "rgb8": (3, cv2.COLOR_RGB2BGR),
     "bgr8": (3, None),
@@ -28,35 +29,24 @@ COLOURS = {
     "yuv422_yuy2": (2, cv2.COLOR_YUV2BGR_YUY2),
     "YUYV": (2, cv2.COLOR_YUV2BGR_YUY2),
 }
-"""Channels of encodings of colour, and OpenCV's conversion to BGR."""
 DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
-_LONGEST = 10
-"""Parts of a number in RVL data beyond the first: more than 32 bits."""
-_CONFIG = struct.Struct("<iff")
-"""Header of compressedDepth: format, and two numbers of the quantisation of floats."""
+_LONGEST = 10  # parts of a number in RVL data beyond the first: more than 32 bits
+_CONFIG = struct.Struct("<iff")  # header of compressedDepth: format, and two numbers of the quantisation of floats
 
 
-def decode_message(place: str, message: Any) -> np.ndarray:
-    """Return the pixels of an Image or a CompressedImage: (H, W, 3) uint8 RGB, or (h, w) of depth as it is stored.
-
-    Raises:
-        ValueError: its size does not fit its data, or they are damaged; the message begins with ``place``.
-
-    """
+def decode_message(message: Any) -> np.ndarray:
+    """Return the pixels of an Image or a CompressedImage: (H, W, 3) uint8 RGB, or (h, w) of depth as it is stored."""
     data = np.asarray(message.data, np.uint8)
     if not hasattr(message, "encoding"):
         if "compresseddepth" in message.format.lower():
-            return _decode_compressed_depth(place, message.format, data)
-        if data.size > PHOTO_LIMIT:
-            raise ValueError(f"{place}: expected a photo of at most {PHOTO_LIMIT} bytes, got {data.size}")
-        with naming(place):
-            return decode_photo(data.tobytes())
+            return _decode_compressed_depth(message.format, data)
+        return decode_photo(data.tobytes())
     channels, code = COLOURS.get(message.encoding, (1, None))
     dtype = np.dtype(DEPTHS.get(message.encoding, "u1")).newbyteorder(">" if message.is_bigendian else "<")
     height, width, step = message.height, message.width, message.step
     if min(height, width) < 1 or step < width * channels * dtype.itemsize or data.size != height * step:
         raise ValueError(
-            f"{place}: expected an image of {width} x {height} pixels in rows of {step} bytes, got {data.size} bytes"
+            f"expected an image of {width} x {height} pixels in rows of {step} bytes, got {data.size} bytes"
         )
     rows = data.reshape(height, step)[:, : width * channels * dtype.itemsize]
     values = np.ascontiguousarray(rows).view(dtype).reshape(height, width, *([channels] if channels > 1 else []))
@@ -65,19 +55,15 @@ def decode_message(place: str, message: Any) -> np.ndarray:
     return cv2.cvtColor(values if code is None else cv2.cvtColor(values, code), cv2.COLOR_BGR2RGB)
 
 
-def _decode_compressed_depth(place: str, encoding: str, data: np.ndarray) -> np.ndarray:
+def _decode_compressed_depth(encoding: str, data: np.ndarray) -> np.ndarray:
     """Return the map of a message of compressedDepth: of whole numbers, or of quantised inverse metres."""
     pixels = None
     kind = "RVL" if "compresseddepth rvl" in encoding.lower() else "a 16-bit PNG"
-    if _CONFIG.size < data.size <= PHOTO_LIMIT:
+    if data.size > _CONFIG.size:
         content = data[_CONFIG.size :].tobytes()
-        if kind == "RVL":
-            with naming(place):
-                pixels = decode_rvl(content)
-        else:
-            pixels = decode_pixels(place, content, cv2.IMREAD_UNCHANGED)
+        pixels = decode_rvl(content) if kind == "RVL" else decode_pixels("depth", content, cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.ndim != 2 or pixels.dtype != np.uint16:
-        raise ValueError(f"{place}: expected depth as {kind} (compressedDepth), got {data.size} bytes of another kind")
+        raise ValueError(f"expected depth as {kind} (compressedDepth), got {data.size} bytes of another kind")
     if "32fc1" not in encoding.lower():
         return pixels
     _, a, b = _CONFIG.unpack(data[: _CONFIG.size].tobytes())
@@ -91,10 +77,6 @@ def decode_rvl(content: bytes) -> np.ndarray:
     The data are 4-bit parts of numbers, the most significant of a 32-bit word first: three bits of the number, the
     lowest first, and one that says that more follow. The numbers are counts of zeros and of other values in turn, and
     behind the latter count the differences of the values, with the sign in the lowest bit.
-
-    Raises:
-        ValueError: they are damaged, or declare more pixels than their length explains.
-
     """
     damaged = f"expected depth as RVL (compressedDepth), got {len(content)} bytes that are damaged"
     if len(content) < 12 or len(content) % 4:

@@ -39,12 +39,13 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from dsr.geometry.poses import as_rigid
 from dsr.io.captures.archive import PHOTO_LIMIT, Section, decode_photo, inflate
+from dsr.io.captures.contract import LIDAR, Capture
 from dsr.io.captures.stray import VideoFrame, check_count
-from dsr.io.frames import CaptureFrame, Geometry
-from dsr.io.pairs import Pair, PairingResult, join, numbered_files
+from dsr.io.frames import CaptureFrame, Geometry, Size, stated
+from dsr.io.pairs import Pair, PairingResult, numbered_files
 from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera, intrinsics_camera
 from dsr.notes import Assumption
-from dsr.utils.guards import natural_key, opened, read_text, refusing
+from dsr.utils.guards import opened, read_text, refusing
 from dsr.utils.validation import describe
 from dsr.utils.versions import how_to_install
 
@@ -56,24 +57,7 @@ _NO_POSE = Assumption("no pose: the capture has none of the frame")
 _JSON, _LARGEST_JSON = "pose_intrinsic_imu.json", 1 << 28
 _VIDEOS = ("rgb.mkv", "rgb.mp4")
 _MAP = (192, 256)
-_LARGEST_MAP = 4 * _MAP[0] * _MAP[1] + (1 << 12)
-"""Largest size in bytes of a compressed map."""
-
-
-def find_sens(place: Path) -> PairingResult | None:
-    """Return the frames of a ``.sens`` file, or of those in a folder; None if there are none.
-
-    Raises:
-        ValueError: a file is damaged, truncated, or compressed in another way.
-
-    """
-    if place.is_file():
-        return _read_sens(place, "") if place.suffix.lower() == ".sens" else None
-    files = sorted((path for path in place.iterdir() if path.suffix.lower() == ".sens"), key=natural_key)
-    files = [path for path in files if path.is_file()]
-    if not files:
-        return None
-    return join(_read_sens(path, f"{path.stem}/") for path in files)
+_LARGEST_MAP = 4 * _MAP[0] * _MAP[1] + (1 << 12)  # bytes of a compressed one
 
 
 class _Sens(NamedTuple):
@@ -87,12 +71,12 @@ class _Sens(NamedTuple):
     frames: int
 
 
-def _read_sens(path: Path, before: str) -> PairingResult:
-    """Return the frames of a file; ``before`` begins their names."""
-    size = path.stat().st_size
+def read_sens(path: Path) -> PairingResult:
+    """Return the frames of a ``.sens`` file."""
+    size, pairs = path.stat().st_size, list[Pair]()
     with opened(path) as file:
         header = _read_header(path, file)
-        place, frames = file.tell(), list[CaptureFrame]()
+        place = file.tell()
         if header.frames > min(size // _FRAME.size, _MOST_FRAMES):
             raise ValueError(f"{path}: expected at most {_MOST_FRAMES} frames, got {header.frames} in {size} bytes")
         for number in range(header.frames):
@@ -105,18 +89,15 @@ def _read_sens(path: Path, before: str) -> PairingResult:
                 raise ValueError(f"{path}: expected {header.frames} frames, it is damaged or ends in frame {number}")
             photo = Section(path, f"color/{number}", start, lengths[0], functools.partial(_photo, header))
             depth = Section(path, f"depth/{number}", start + lengths[0], lengths[1], functools.partial(_depth, header))
-            geometry = functools.partial(_geometry, f"{path}: frame {number}", header, values[:16])
+            geometry = _geometry(f"{path}: frame {number}", header, values[:16])
             about = content[:64] + repr(header).encode()
-            frames.append(CaptureFrame("ScanNet", geometry, path, about, photo, depth, 1e-6 * values[16]))
-    if not any(frame.time for frame in frames):  # as where they are not known
-        frames = [replace(frame, time=None) for frame in frames]
-    pairs = [
-        Pair(f"{before}{number:06}", path / f"color/{number}", path / f"depth/{number}", unit=1 / header.scale,
-             capture=frame)
-        for number, frame in enumerate(frames)
-    ]  # fmt: skip
+            frame = CaptureFrame("ScanNet", geometry, path, about, photo, depth)
+            files, time = (path / photo.name, path / depth.name), 1e-6 * values[16]
+            pairs.append(Pair(f"{number:06}", *files, unit=1 / header.scale, capture=frame, time=time))
     if not pairs:
         raise ValueError(f"{path}: expected frames, there is none")
+    if not any(pair.time for pair in pairs):  # as where they are not known
+        pairs = [replace(pair, time=None) for pair in pairs]
     unit = "millimetres" if header.scale == 1000 else f"1/{header.scale:g} m"
     return PairingResult(tuple(pairs), (describe_capture("a recording of ScanNet", unit, pairs, poses=True),))
 
@@ -162,12 +143,16 @@ def _depth(header: _Sens, content: bytes) -> np.ndarray:
     return np.frombuffer(values, "<u2").reshape(header.depth)
 
 
-def _geometry(place: str, header: _Sens, values: tuple[float, ...], _: tuple[int, int]) -> Geometry:
+def _geometry(place: str, header: _Sens, values: tuple[float, ...]) -> Geometry:
     """Return camera and pose of a frame."""
-    camera, matrix = intrinsics_camera(place, header.photo, header.intrinsics), np.reshape(values, (4, 4))
-    if not np.isfinite(matrix).all():
-        return Geometry(camera, None, (_NO_POSE,))
-    return Geometry(camera, as_rigid(matrix, place))
+
+    def geometry() -> Geometry:
+        camera, matrix = intrinsics_camera(place, header.photo, header.intrinsics), np.reshape(values, (4, 4))
+        if not np.isfinite(matrix).all():
+            return Geometry(camera, None, (_NO_POSE,))
+        return Geometry(camera, as_rigid(matrix, place))
+
+    return stated(geometry)
 
 
 _Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -184,13 +169,8 @@ class _Entry(BaseModel, strict=True):
 _ENTRIES = TypeAdapter(dict[str, _Entry])
 
 
-def find_scannetpp(folder: Path) -> PairingResult | None:
-    """Return the frames of the iPhone in a scene of ScanNet++, or of its folder ``iphone``; None if there are none.
-
-    Raises:
-        ValueError: the description or the maps are damaged, or the maps are compressed all at once.
-
-    """
+def _find_scannetpp(folder: Path) -> PairingResult | None:
+    """Return the frames of the iPhone in a scene of ScanNet++, or of its folder ``iphone``."""
     folder = folder / "iphone" if (folder / "iphone" / _JSON).is_file() else folder
     path, packed = folder / _JSON, folder / "depth.bin"
     depths: Mapping[int, Path | Section] = numbered_files(folder / "depth", (".png",), "frame_")
@@ -211,14 +191,12 @@ def find_scannetpp(folder: Path) -> PairingResult | None:
             unpaired.append(place)
             continue
         entry = entries.get(f"frame_{number:06}", _Entry())
-        frame = CaptureFrame(
-            "ScanNet++ iPhone",
-            functools.partial(_iphone_geometry, f"{path}: frame_{number:06}", entry),
-            path,
-            entry.model_dump_json().encode(),
-            None if photos or video is None else VideoFrame(video, number),
-            None if isinstance(depth, Path) else depth,
-        )
+        geometry = functools.partial(_iphone_geometry, f"{path}: frame_{number:06}", entry)
+        frame = CaptureFrame("ScanNet++ iPhone", geometry, path, entry.model_dump_json().encode())
+        if not photos and video is not None:
+            frame = replace(frame, photo=VideoFrame(video, number))
+        if not isinstance(depth, Path):
+            frame = replace(frame, depth=depth)
         photo = photos.get(number) or (video or folder) / f"{number:06}"
         pairs.append(Pair(f"{number:06}", photo, place, unit=1e-3, capture=frame))
     notes = [describe_capture("the iPhone of a scene of ScanNet++", "millimetres", pairs, poses=True)]
@@ -257,10 +235,28 @@ def _map(content: bytes) -> np.ndarray:
     return 1000 * np.frombuffer(inflate(content, 4 * count, -zlib.MAX_WBITS), "<f4").reshape(_MAP)
 
 
-def _iphone_geometry(place: str, entry: _Entry, size: tuple[int, int]) -> Geometry:
+def _iphone_geometry(place: str, entry: _Entry, size: Size) -> Geometry:
     """Return camera and pose of a frame."""
     camera, notes = None, [] if entry.aligned_pose else [_NO_POSE]
     if entry.intrinsic is not None:
         (fx, _, cx), (_, fy, cy), _ = entry.intrinsic
         camera = fitting_camera(place, (size, USUAL_SIZE), (fx, fy, cx, cy))
     return Geometry(camera, as_rigid(entry.aligned_pose, place) if entry.aligned_pose else None, tuple(notes))
+
+
+SCANNETPP = Capture(
+    "ScanNet++ iPhone",
+    "`iphone/` of a scene",
+    "`pose_intrinsic_imu.json` with `rgb.mkv` or `rgb/`, and `depth.bin` or `depth/`",
+    "depth in mm (LZ4) or m (deflate), 256 x 192; intrinsics and pose of each frame",
+    "written by its format",
+    LIDAR,
+    "https://github.com/scannetpp/scannetpp/blob/main/iphone/prepare_iphone_data.py",
+    _find_scannetpp,
+    marks=("pose_intrinsic_imu.json", "depth.bin"),
+    needs={
+        "pose_intrinsic_imu.json": ("pose_intrinsic_imu.json",),
+        "depth.bin": ("depth.bin", "depth/*.png"),
+        "rgb.mkv": ("rgb.mkv", "rgb.mp4", "rgb/*.jpg"),
+    },
+)

@@ -10,8 +10,6 @@ The odometry's quaternion turns a camera with the axes x right, y down, z forwar
 turns ARKit's camera by 180 degrees around x before it writes the pose (OdometryEncoder.swift). ``frame`` numbers the
 maps, and the video's frames if those are counted that its edit list hides: the app writes the first one at a time
 before 0 (VideoEncoder.swift).
-
-Frames of videos, decoded one by one as they are asked for.
 """
 
 from __future__ import annotations
@@ -31,12 +29,13 @@ import cv2
 import numpy as np
 
 from dsr.geometry.camera import Camera
-from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Record, file_state
+from dsr.io.captures.contract import LIDAR, Capture
+from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Record, Size, Source, file_state
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult, numbered_files
 from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera, pose_from_quaternion
 from dsr.notes import Assumption
 from dsr.utils.decoding import QUIET_DECODERS
-from dsr.utils.guards import expect_pixels, numbers_in, read_text
+from dsr.utils.guards import expect_pixels, numbers_in, read_text, refusing
 from dsr.utils.versions import hash_once
 
 _APP = "Stray Scanner"
@@ -44,27 +43,18 @@ _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _Row = Mapping[str, str]
 
-_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
-_ALL_FRAMES = "ignore_editlist;1"
-"""Makes FFmpeg decode the frames that the file's edit list hides: Stray Scanner's first one."""
+# Makes FFmpeg decode the frames that the file's edit list hides: Stray Scanner's first one.
+_OPTIONS, _ALL_FRAMES = "OPENCV_FFMPEG_CAPTURE_OPTIONS", "ignore_editlist;1"
 _LOG_LEVEL, _SILENT = "OPENCV_FFMPEG_LOGLEVEL", "-8"
-_LARGEST = 1 << 25
-"""Largest number of pixels of a frame, that of 8K; a decoder keeps many frames."""
+_LARGEST = 1 << 25  # pixels of a frame, those of 8K; a decoder keeps many frames
 _LOCK = threading.Lock()
 
 
-def find_stray(folder: Path) -> PairingResult | None:
-    """Return the frames of a folder of Stray Scanner; None if it is none.
-
-    Raises:
-        ValueError: it is one, and a file that all frames need is damaged.
-
-    """
+def _find(folder: Path) -> PairingResult | None:
+    """Return the frames of a folder of Stray Scanner."""
     video, matrix, odometry = folder / "rgb.mp4", folder / "camera_matrix.csv", folder / "odometry.csv"
-    if not (matrix.is_file() or odometry.is_file()):
-        return None
     photos, depths = numbered_files(folder / "rgb", PHOTO_SUFFIXES), numbered_files(folder / "depth", (".png", ".npy"))
-    if not depths or not (photos or video.is_file()):
+    if not (matrix.is_file() or odometry.is_file()) or not depths or not (photos or video.is_file()):
         return None
     confidence, rows = numbered_files(folder / "confidence", (".png",)), _read_odometry(odometry)
     text = read_text(matrix) if matrix.is_file() else ""
@@ -77,38 +67,35 @@ def find_stray(folder: Path) -> PairingResult | None:
         row = rows.get(number, {})
         described = (odometry if row else matrix, repr((text, sorted(row.items()))).encode())
         geometry = functools.partial(_geometry, folder, number, row, text)
-        source = None if photo else VideoFrame(video, number)
-        time = next((value for value in numbers_in([row.get("timestamp", "")]) if math.isfinite(value)), None)
-        frame = CaptureFrame(_APP, geometry, *described, photo=source, time=time)
+        frame = CaptureFrame(_APP, geometry, *described, photo=None if photo else VideoFrame(video, number))
         known = ConfidenceMap(confidence[number], HIGHEST_LEVEL) if number in confidence else None
-        rgb = photo or video / f"{number:06}"
-        pairs.append(Pair(f"{number:06}", rgb, depth, unit=1e-3, capture=frame, confidence=known))
+        time = next((value for value in numbers_in([row.get("timestamp", "")]) if math.isfinite(value)), None)
+        files = photo or video / f"{number:06}", depth
+        pairs.append(Pair(f"{number:06}", *files, unit=1e-3, capture=frame, confidence=known, time=time))
     unpaired += [path for number, path in photos.items() if number not in depths]
-    found = describe_capture(f"a capture of {_APP}", "millimetres", pairs, poses=bool(rows))
-    notes = (found,) if photos else (found, *check_count(video, max(depths) + 1))
-    return PairingResult(tuple(pairs), notes, tuple(unpaired))
+    notes = [describe_capture(f"a capture of {_APP}", "millimetres", pairs, poses=bool(rows))]
+    if not photos:
+        notes += check_count(video, max(depths) + 1)
+    return PairingResult(tuple(pairs), tuple(notes), tuple(unpaired))
 
 
 def check_count(video: Path, expected: int) -> list[Assumption]:
     """Return a warning if a video has another number of frames than there are maps: they may belong to others."""
     try:
-        count = count_frames(video)
+        with _LOCK:
+            count = _player(video, file_state(video, "a video")).count
     except ValueError:  # each frame says so when it is read
         return []
-    if count == expected:
-        return []
     text = f"{video.name} has {count} frames, the depth maps count to {expected}: photos may be some frames off"
-    return [Assumption(text)]
+    return [] if count == expected else [Assumption(text)]
 
 
 def _read_odometry(path: Path) -> dict[int, _Row]:
     """Return the rows of the odometry by frame, with their values as text; empty without the file."""
     if not path.is_file():
         return {}
-    try:
+    with refusing(f"{path}: expected a table of {_APP}, got a damaged or foreign file", csv.Error):
         names, *lines = list(csv.reader(read_text(path).splitlines(), skipinitialspace=True)) or [[]]
-    except csv.Error as error:
-        raise ValueError(f"{path}: expected a table of {_APP}, got a damaged or foreign file ({error})") from error
     names = [name.strip() for name in names]
     missing = [name for name in ("frame", *_POSE) if name not in names]
     if missing:
@@ -121,36 +108,30 @@ def _read_odometry(path: Path) -> dict[int, _Row]:
     return rows
 
 
-def _geometry(folder: Path, number: int, row: _Row, matrix: str, size: tuple[int, int]) -> Geometry:
+def _geometry(folder: Path, number: int, row: _Row, matrix: str, size: Size) -> Geometry:
     """Return camera and pose of a frame."""
     place = f"{folder / 'odometry.csv'}: frame {number}"
-    assumptions = []
-    pose = None
+
+    def numbers(names: tuple[str, ...]) -> list[float]:
+        came = [row.get(name, "nothing") for name in names]
+        if not (values := numbers_in(came)):
+            raise ValueError(f"{place}: expected numbers for {', '.join(names)}, got {', '.join(came):.120}")
+        return values
+
+    camera, pose, notes = None, None, []
     if row:
-        values = _numbers(place, row, _POSE)
+        values = numbers(_POSE)
         pose = pose_from_quaternion(place, values[3:], values[:3])
     else:
-        assumptions.append(Assumption("no pose: odometry.csv has none of the frame"))
-    own = all(row.get(name) for name in _INTRINSICS)
-    if own:
-        camera = _camera(folder, place, _numbers(place, row, _INTRINSICS), size)
-        return Geometry(camera, pose, tuple(assumptions), up="y")
-    if not matrix:
-        return Geometry(None, pose, tuple(assumptions), up="y")
-    assumptions.append(
-        Assumption("camera: camera_matrix.csv of the whole capture; odometry.csv has none of each frame")
-    )
-    path = folder / "camera_matrix.csv"
-    camera = _camera(folder, str(path), _read_matrix(path, matrix), size)
-    return Geometry(camera, pose, tuple(assumptions), up="y")
-
-
-def _numbers(place: str, row: _Row, names: tuple[str, ...]) -> list[float]:
-    """Return values of a row as numbers."""
-    came = [row.get(name, "nothing") for name in names]
-    if not (values := numbers_in(came)):
-        raise ValueError(f"{place}: expected numbers for {', '.join(names)}, got {', '.join(came):.120}")
-    return values
+        notes.append(Assumption("no pose: odometry.csv has none of the frame"))
+    if all(row.get(name) for name in _INTRINSICS):
+        camera = _camera(folder, place, numbers(_INTRINSICS), size)
+    elif matrix:
+        text = "camera: camera_matrix.csv of the whole capture; odometry.csv has none of each frame"
+        notes.append(Assumption(text))
+        path = folder / "camera_matrix.csv"
+        camera = _camera(folder, str(path), _read_matrix(path, matrix), size)
+    return Geometry(camera, pose, tuple(notes), up="y")
 
 
 def _read_matrix(path: Path, text: str) -> list[float]:
@@ -162,44 +143,30 @@ def _read_matrix(path: Path, text: str) -> list[float]:
     return [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
 
 
-def _camera(folder: Path, place: str, numbers: list[float], size: tuple[int, int]) -> Camera:
+def _camera(folder: Path, place: str, numbers: list[float], size: Size) -> Camera:
     """Return the camera, of the photo's pixels, or of the video's if extracted photos were made smaller."""
-    sizes = [size]
-    if (folder / "rgb.mp4").is_file() and (folder / "rgb").is_dir():
-        sizes.append(video_size(folder / "rgb.mp4"))
+    video, sizes = folder / "rgb.mp4", [size]
+    if video.is_file() and (folder / "rgb").is_dir():
+        height, width, _ = VideoFrame(video, 0).read().shape
+        sizes.append((height, width))
     return fitting_camera(place, (*sizes, USUAL_SIZE), numbers)
 
 
 @dataclass(frozen=True)
-class VideoFrame:
-    """A :class:`~dsr.io.frames.Source` of a frame of a video.
-
-    Args:
-        file: the video.
-        index: number of the frame, from 0.
-
-    """
+class VideoFrame(Source):
+    """The frame of a video with a number from 0, decoded as it is asked for."""
 
     file: Path
     index: int
 
     def read(self) -> np.ndarray:
-        """Return the frame, (H, W, 3) uint8 RGB.
-
-        Raises:
-            ValueError: the file is no video, is damaged, or ends before the frame.
-
-        """
+        """Return the frame, (H, W, 3) uint8 RGB."""
         with _LOCK:
             return _player(self.file, file_state(self.file, "a video")).read(self.index)
 
     def record(self) -> Record:
         """Return the video's name and hash, and the frame's number."""
-        return {
-            "file": self.file.name,
-            "frame": self.index,
-            "sha256": hash_once(self.file),
-        }
+        return {"file": self.file.name, "frame": self.index, "sha256": hash_once(self.file)}
 
 
 class _Player:
@@ -211,7 +178,7 @@ class _Player:
 
     @property
     def count(self) -> int:
-        """Number of frames that the file declares."""
+        """Number of frames that the file declares, those that an edit list hides among them."""
         return int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
 
     def read(self, index: int) -> np.ndarray:
@@ -232,8 +199,6 @@ class _Player:
 
     def _open(self) -> cv2.VideoCapture:
         """Open the video at its first frame."""
-        if not self._path.is_file():
-            raise ValueError(f"{self._path}: expected a video, there is none")
         os.environ.setdefault(_LOG_LEVEL, _SILENT)  # read once; its threads may print messages later
         with QUIET_DECODERS, _environment(_OPTIONS, _ALL_FRAMES):
             capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
@@ -245,30 +210,8 @@ class _Player:
         return capture
 
 
-def count_frames(path: Path) -> int:
-    """Return how many frames a video declares, those that an edit list hides among them.
-
-    Raises:
-        ValueError: the file is no video.
-
-    """
-    with _LOCK:
-        return _player(path, file_state(path, "a video")).count
-
-
-def video_size(path: Path) -> tuple[int, int]:
-    """Return height and width of a video's frames.
-
-    Raises:
-        ValueError: the file is no video.
-
-    """
-    shape = VideoFrame(path, 0).read().shape
-    return shape[0], shape[1]
-
-
 @functools.lru_cache(maxsize=1)
-def _player(path: Path, _: tuple[int, int]) -> _Player:
+def _player(path: Path, _state: tuple[int, int]) -> _Player:
     """Return the open video."""
     return _Player(path)
 
@@ -285,3 +228,17 @@ def _environment(name: str, value: str) -> Iterator[None]:
             del os.environ[name]
         else:
             os.environ[name] = before
+
+
+STRAY = Capture(
+    _APP,
+    "share the scan's folder",
+    "`camera_matrix.csv` or `odometry.csv`, with `depth/` and `rgb.mp4` or `rgb/000000.png`",
+    "depth in mm (16-bit PNG, NPY); intrinsics and pose of each frame; confidence 0 to 2",
+    "tables of a real scan; pictures written by its format",
+    LIDAR,
+    "https://github.com/strayrobots/scanner/blob/main/docs/format.md",
+    _find,
+    marks=("odometry.csv", "camera_matrix.csv"),
+    needs={"depth/": ("depth/*",), "rgb.mp4 or rgb/": ("rgb.mp4", "rgb/*")},
+)

@@ -17,14 +17,14 @@ from __future__ import annotations
 
 import configparser
 import functools
-import re
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from dsr.io.frames import CaptureFrame, Geometry
-from dsr.io.pairs import Pair, PairingResult
+from dsr.io.captures.contract import STEREO, Capture
+from dsr.io.frames import CaptureFrame, Geometry, Size
+from dsr.io.pairs import Pair, PairingResult, numbered_files, paired
 from dsr.io.trajectories import describe_capture, intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import numbers_in, read_text, refusing
@@ -37,33 +37,26 @@ _RESOLUTIONS = {
 _CAMERA = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 
 
-def find_zed(folder: Path) -> PairingResult | None:
-    """Return the frames of a folder of exported pictures with a calibration; None if it is none.
-
-    Raises:
-        ValueError: it has several calibrations.
-
-    """
+def _find(folder: Path) -> PairingResult | None:
+    """Return the frames of a folder of exported pictures with a calibration."""
     calibrations = sorted(path for path in folder.glob("SN*.conf") if path.is_file())
-    if not calibrations:
-        return None
-    found: dict[str, dict[str, Path]] = {"left": {}, "depth": {}}
-    for path in sorted(folder.iterdir()):
-        if match := re.fullmatch(r"(left|depth)(\d{1,9})\.png", path.name):
-            found[match[1]][match[2]] = path
-    both = sorted(found["left"].keys() & found["depth"].keys())
-    if not both:
+    photos, depths = (numbered_files(folder, (".png",), kind) for kind in ("left", "depth"))
+    both, unpaired = paired(photos, depths)
+    if not calibrations or not both:
         return None
     if len(calibrations) > 1:
         raise ValueError(f"{folder}: expected one calibration of {_APP}, got {', '.join(p.name for p in calibrations)}")
-    text = read_text(calibrations[0])
-    frame = CaptureFrame(_APP, functools.partial(_geometry, calibrations[0], text), calibrations[0], text.encode())
-    pairs = tuple(Pair(name, found["left"][name], found["depth"][name], unit=1e-3, capture=frame) for name in both)
-    lone = tuple(path for each in found.values() for name, path in each.items() if name not in both)
-    return PairingResult(pairs, (describe_capture(f"pictures of {_APP}", "millimetres", pairs, poses=False),), lone)
+    path, text = calibrations[0], read_text(calibrations[0])
+    frame = CaptureFrame(_APP, functools.partial(_geometry, path, text), path, text.encode())
+    pairs = tuple(
+        Pair(photos[number].stem.removeprefix("left"), photos[number], depths[number], unit=1e-3, capture=frame)
+        for number in both
+    )
+    note = describe_capture(f"pictures of {_APP}", "millimetres", pairs, poses=False)
+    return PairingResult(pairs, (note,), unpaired)
 
 
-def _geometry(path: Path, text: str, size: tuple[int, int]) -> Geometry:
+def _geometry(path: Path, text: str, size: Size) -> Geometry:
     """Return the camera of the rectified photo of (height, width)."""
     if size not in _RESOLUTIONS:
         sizes = ", ".join(f"{width} x {height}" for height, width in _RESOLUTIONS)
@@ -75,24 +68,35 @@ def _geometry(path: Path, text: str, size: tuple[int, int]) -> Geometry:
     if parser.has_section("STEREO"):
         for name in ("TY", "TZ"):
             parser["STEREO"].setdefault(f"{name}_{resolution}", parser.get("STEREO", name, fallback="0"))
-    cameras = [_values(path, parser, f"{side}_CAM_{resolution}", _CAMERA) for side in ("LEFT", "RIGHT")]
-    names = ("Baseline", *(f"{name}_{resolution}" for name in ("TY", "TZ", "RX", "CV", "RZ")))
-    between = _values(path, parser, "STEREO", names)
-    matrices = [np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) for fx, fy, cx, cy, *_ in cameras]
-    lenses = [np.array(each[4:]) for each in cameras]
+
+    def numbers(section: str, *names: str) -> np.ndarray:
+        came = [parser.get(section, name, fallback="nothing") for name in names]
+        values = np.array(numbers_in(came))
+        if not len(values) or not np.isfinite(values).all():
+            raise ValueError(f"{path}: {section}: expected numbers for {', '.join(names)}, got {', '.join(came):.120}")
+        return values
+
+    left, right = (numbers(f"{side}_CAM_{resolution}", *_CAMERA) for side in ("LEFT", "RIGHT"))
+    between = numbers("STEREO", "Baseline", *(f"{name}_{resolution}" for name in ("TY", "TZ", "RX", "CV", "RZ")))
+    matrices = [np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) for fx, fy, cx, cy, *_ in (left, right)]
     with refusing(f"{path}: expected the calibration of two cameras side by side, got another", cv2.error):
         rectified = cv2.stereoRectify(
-            matrices[0], lenses[0], matrices[1], lenses[1], size[::-1], cv2.Rodrigues(np.array(between[3:]))[0],
-            np.array(between[:3]).reshape(3, 1), flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
+            matrices[0], left[4:], matrices[1], right[4:], size[::-1], cv2.Rodrigues(between[3:])[0],
+            between[:3].reshape(3, 1), flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
         )[2]  # fmt: skip
     camera = intrinsics_camera(str(path), size, [float(rectified[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2))])
     return Geometry(camera, None, (Assumption("camera: that of the factory calibration, which the SDK refines"),))
 
 
-def _values(path: Path, parser: configparser.ConfigParser, section: str, names: tuple[str, ...]) -> list[float]:
-    """Return numbers of a section."""
-    came = [parser.get(section, name, fallback="nothing") for name in names]
-    values = numbers_in(came)
-    if not values or not np.isfinite(values).all():
-        raise ValueError(f"{path}: {section}: expected numbers for {', '.join(names)}, got {', '.join(came):.120}")
-    return values
+ZED = Capture(
+    _APP,
+    "LEFT + DEPTH_16Bit of the SDK's sample SVO Export, and `SN*.conf` of the settings folder put beside it",
+    "`left000000.png`, `depth000000.png` and `SN*.conf`",
+    "depth in mm (16-bit PNG); intrinsics of the rectified photo (2208, 1920, 1280, 960 or 672 pixels wide)",
+    "written by its format; calibrations as other programs' tests have them",
+    STEREO,
+    "https://github.com/stereolabs/zed-open-capture",
+    _find,
+    marks=("SN*.conf", "left000000.png"),
+    needs={"left*.png": ("left*.png",), "depth*.png": ("depth*.png",), "SN*.conf": ("SN*.conf",)},
+)
