@@ -99,8 +99,9 @@ def get_data_sets(request: DataGetRequest, console: Console, catalogue: Mapping[
         show(console, f"{missing} of {len(items)} files are missing in {root.absolute()}")
     if missing and not request.yes and sys.stdin.isatty() and console.is_terminal and not _agreed(console):
         return []
-    given = {"mirror": request.mirror, "keep_archives": request.keep_archives}
-    problems = get(items.values(), root, progress, **given) if items else []
+    problems = []
+    if items:
+        problems = get(items.values(), root, progress, mirror=request.mirror, keep_archives=request.keep_archives)
     for collection in collections:
         if not collection.items:
             problems += verify(collection, root, progress)

@@ -40,7 +40,10 @@ class Rule(NamedTuple):
     def expect(self, name: str, value: Any) -> None:
         """Raise OptionError if the value of an option is not as expected."""
         for one in value if self.each else (value,):
-            if not self.holds(one):
+            holds = False
+            with contextlib.suppress(TypeError):  # a value of another type, from Python
+                holds = self.holds(one)
+            if not holds:
                 shown = " ".join(map(_shown, one if isinstance(one, tuple) else (one,)))
                 raise OptionError(name, f"expected {self.expected}, got {shown}{did_you_mean(one, self.known)}")
 
