@@ -125,7 +125,8 @@ class Work:
         with TemporaryDirectory(dir=self._folder) as place:
             result = Path(place) / "dsr-result"
             if capture:
-                for text in self._run(Path(place), "upsample", capture, "--dry-run", f"--output={result.name}"):
+                count = "--dry-run", "--shard=1/999999999"  # counts the frames, and reads a sample of them
+                for text in self._run(Path(place), "upsample", capture, *count, f"--output={result.name}"):
                     yield text, "", "", None
                 found = re.search(r"^(\d+) pairs of photo and depth map$", text, re.MULTILINE)
                 frames = 1 if found is None else int(found[1])
