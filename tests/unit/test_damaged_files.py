@@ -58,6 +58,7 @@ from dsr.report.study.key import Candidate, Key, Trial, read_key, write_key
 from dsr.report.study.study_table import read_study
 from dsr.report.surface_page import is_view
 from dsr.sample import DepthSample
+from dsr.utils.arrays import read_arrays
 from dsr.utils.configuration import ConfigError
 from dsr.utils.console import one_line, print_error
 from dsr.utils.guards import TooLargeError, is_number, parse_json, read_limited, read_member
@@ -141,6 +142,11 @@ def written(tmp_path_factory):
 def test_bomb_is_refused_in_one_line_and_little_memory(tmp_path, limited, written, write, name, read):
     (tmp_path / name).hardlink_to(written(write))
     assert "expected" in refusal(tmp_path / name, read, tmp_path / name)
+
+
+def test_archive_of_arrays_is_not_unpacked_to_more_than_its_size_explains(written):
+    with pytest.raises(TooLargeError, match="expected at most 268435456 bytes"):
+        read_arrays(written(bombs.npz))
 
 
 def test_command_limits_its_memory_to_that_of_the_machine():

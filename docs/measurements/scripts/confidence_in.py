@@ -26,7 +26,8 @@ from torch import Tensor
 from dsr.degradation.downsampling import Downsampling, relative_error
 from dsr.geometry.camera import Camera, from_range
 from dsr.geometry.surface import depth_to_normals
-from dsr.io.cameras import read_camera, read_rgb
+from dsr.io.cameras import read_camera
+from dsr.io.images import read_rgb
 from dsr.methods.networks.facets_method import AnyMap
 from dsr.methods.recipe import Run, read_recipe
 from dsr.sample import DepthSample

@@ -30,9 +30,8 @@ from dsr.utils.progress import show_length
 from dsr.utils.validation import Number, parse_model
 
 _FOCAL_OF_ONE = 20  # focal length in widths of the picture, which no lens of a photo with depth has
-_FILM_DIAGONAL = math.hypot(
-    36, 24
-)  # of 35 mm film in millimetres, which equivalent focal lengths refer to (CIPA DCG-001)
+# Of 35 mm film in millimetres, which equivalent focal lengths refer to (CIPA DCG-001).
+_FILM_DIAGONAL = math.hypot(36, 24)
 _SAMPLE = 100_000  # depths that percentiles are taken of
 _METRES = {"m": 1.0, "mm": 1e-3}
 

@@ -21,10 +21,8 @@ from dsr.utils.files import replacing
 _TO_GLTF = np.array([1, -1, -1])
 _STEPS = 65535
 _FINEST = 4e-4  # of the distance of the nearest point: largest step between positions; the rest has floats
-_LARGEST_TEXTURE, _LOSSLESS = (
-    4096,
-    2**16,
-)  # pixels of a side, which every viewer supports, and of a picture without loss
+_LARGEST_TEXTURE = 4096  # pixels of a side, which every viewer supports
+_LOSSLESS = 2**16  # pixels of a texture that is stored without loss
 _QUALITY = 95  # of a JPEG with colours at half the resolution: at full resolution it takes 6 to 34 % more
 _TYPES = {"int8": 5120, "uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
 _ATTRIBUTES, _INDICES = 34962, 34963

@@ -8,16 +8,21 @@ from pathlib import Path
 
 import numpy as np
 
-from dsr.utils.guards import opened, refusing
+from dsr.utils.guards import bytes_of_archive, expect_bytes, opened, refusing
 
 _REFUSAL = "{}: expected an archive of arrays, got a damaged or foreign file"
 
 
 def read_arrays(path: Path, names: Container[str] | None = None) -> dict[str, np.ndarray]:
     """Return the arrays of an ``.npz`` file: all, or those of some names that it has."""
-    # a damaged archive makes NumPy raise BadZipFile, EOFError, zlib.error, ...
-    with opened(path) as file, refusing(_REFUSAL.format(path), Exception), np.load(file) as arrays:
-        return {name: arrays[name] for name in arrays.files if names is None or name in names}
+    with opened(path) as file:
+        # a damaged archive makes NumPy raise BadZipFile, EOFError, zlib.error, ...
+        with refusing(_REFUSAL.format(path), Exception):
+            arrays = np.load(file)
+            unpacked = sum(member.file_size for member in arrays.zip.infolist())
+        expect_bytes(path, unpacked, bytes_of_archive(path.stat().st_size))
+        with refusing(_REFUSAL.format(path), Exception):
+            return {name: arrays[name] for name in arrays.files if names is None or name in names}
 
 
 def array_headers(path: Path) -> dict[str, tuple[tuple[int, ...], np.dtype]]:

@@ -465,8 +465,10 @@ def _checked_hash(
         digest = file_hash(path, moved)
     expected = pinned or (checksums[name].sha256 if name in checksums else None)
     if expected not in (None, digest):
-        known = f"as recorded in {checksums.path}" if pinned is None else "which dsr knows"
-        raise ValueError(f"{source}: expected sha256 {expected}, {known}, got {digest}")
+        known, cure = "which dsr knows", ""
+        if pinned is None:
+            known, cure = f"as recorded in {checksums.path}", "; if the new one is right, delete the entry there"
+        raise ValueError(f"{source}: expected sha256 {expected}, {known}, got {digest}{cure}")
     return digest
 
 

@@ -43,9 +43,9 @@ class Capture:
     export: str
     found_by: str
     read: str
-    tried: str
-    faults: str
-    source: str
+    tried: str = ""
+    faults: str = ""
+    source: str = ""
     of_folder: Callable[[Path], PairingResult | None] = lambda _: None
     of_file: Callable[[Path], PairingResult] | None = None
     suffixes: tuple[str, ...] = ()
