@@ -34,6 +34,11 @@ def _entries(texts):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Gain(Options):
+    gain: float = option(1.0, "a gain", rule=positive("number"))
+
+
+@dataclass(frozen=True, kw_only=True)
 class Rig(Options):
     file: Path = option(..., "camera of the rig", flags="--rig-camera")
     pose: Path = option(..., "its pose")
@@ -115,6 +120,11 @@ def test_wrong_value_is_named_as_a_flag_and_as_an_argument(words, name, values, 
         _parse(*words.split())
     with pytest.raises(OptionError, match=f"^{name}: {message}$"):
         Request(output=Path("out"), **values)
+
+
+def test_value_of_another_type_from_python_is_refused_as_any_other():
+    with pytest.raises(OptionError, match="gain: expected a positive number, got 'much'"):
+        Gain(gain="much")
 
 
 def test_value_that_cannot_be_parsed_is_one_line_with_the_flag():

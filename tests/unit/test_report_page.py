@@ -183,6 +183,15 @@ def test_large_pictures_are_reduced_and_the_page_says_so(make_run, tmp_path):
     assert save_page(tmp_path / "large.html", Pictures(workers))[0].startswith("pictures: lossless, 8 bits;")
 
 
+def test_pictures_of_many_surfaces_are_smaller_unless_a_size_is_given(make_run, tmp_path, monkeypatch):
+    workers = WorkerPool(load_results([make_run(tmp_path / "run", size=64)]))
+    assert Pictures(workers).longest == 1024
+    monkeypatch.setattr("dsr.report.page._MOST_PIXELS", 300)
+    surfaces = 3 * len(Pictures(workers).places)
+    assert Pictures(workers).longest == math.isqrt(300 // surfaces)
+    assert Pictures(workers, 512).longest == 512
+
+
 def test_pictures_are_lossless():
     picture = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
     smooth = np.add.outer(np.arange(200), np.arange(300)).astype(np.uint8)[..., None]

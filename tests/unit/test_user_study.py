@@ -89,10 +89,18 @@ FOUR = (
 )
 
 
+@pytest.mark.parametrize(("count", "n"), [(0, 1), (1, 1), (0, 136), (3, 136), (5, 10), (136, 136)])
+def test_wilson_interval_equals_scipy(count, n):
+    theirs = binomtest(count, n).proportion_ci(0.95, method="wilson")
+    assert wilson(count, n) == pytest.approx((theirs.low, theirs.high), abs=1e-12)
+
+
 def test_interval_of_an_average_is_wilsons_with_one_answer_a_person_where_all_agree():
     ones = np.ones((12, 5), int)
     assert bootstrap_of_average(ones, ones) == pytest.approx(wilson(12, 12))
     assert bootstrap_of_average(0 * ones, ones) == pytest.approx(wilson(0, 12))
+    low, high = bootstrap_of_average(np.tile([1, 0], (5, 1)), np.ones((5, 2), int))  # one scene of two
+    assert low + high == pytest.approx(1)
 
 
 def test_average_weighs_scenes_equally_without_those_without_answers():

@@ -46,7 +46,12 @@ class ReportRequest(RunsRequest):
     leaderboard: bool = option(False, "the page begins with one row a method, by mean rank")
     strict: bool = option(False, "refuse runs with a warning; see docs/checks.md")
     title: str = option("Depth super-resolution", "of the page")
-    page_px: int = option(1024, "maximum longer side of a picture of the page, pixels; 1024", "N", rule=at_least(16))
+    page_px: int | None = option(
+        None,
+        "maximum longer side of a picture of the page, pixels (default: 1024, less if it has more than 48 surfaces)",
+        "N",
+        rule=at_least(16),
+    )
     parts: tuple[str, ...] = option(
         REPORT_PARTS,
         "these parts alone, of tables, metrics, figures, page",

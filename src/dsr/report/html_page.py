@@ -55,11 +55,6 @@ def json_text(value: Any) -> str:
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
 
 
-def block(name: str, content: str, kind: str = "application/json") -> str:
-    """Return data as an element that a browser neither shows nor runs."""
-    return f'<script type="{kind}" id="{name}">{content}</script>'
-
-
 @functools.cache
 def palette(name: str) -> str:
     """Return the 256 colours of a colour map, six hexadecimal digits each."""

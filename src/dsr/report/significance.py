@@ -14,7 +14,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import binomtest, bootstrap, norm, t
+from scipy.stats import norm, t
 
 LEAST = 5
 """Smallest number of scenes of an interval."""
@@ -32,8 +32,7 @@ def interval_of_mean(values: Sequence[float]) -> tuple[float, float] | None:
     if count < LEAST:
         return None
     tail = float(norm.cdf(math.sqrt(count / (count - 1)) * t.ppf(LEVEL / 2, count - 1)))
-    drawn = bootstrap((values,), np.mean, n_resamples=_DRAWS, confidence_level=1 - 2 * tail, method="percentile", rng=0)
-    low, high = drawn.confidence_interval
+    low, high = np.quantile(_draws(count) @ np.asarray(values), [tail, 1 - tail])
     return float(low), float(high)
 
 
@@ -49,6 +48,12 @@ def p_of_difference(first: Sequence[float], second: Sequence[float]) -> float:
 
 
 @functools.lru_cache(maxsize=16)
+def _draws(count: int) -> np.ndarray:
+    """Return the weights of scenes in each draw, (draws, count), which all cells of a table share."""
+    return np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), size=_DRAWS) / count
+
+
+@functools.lru_cache(maxsize=16)
 def _signs(count: int) -> np.ndarray:
     """Return changes of sign, (changes, count): all, or for many scenes random ones after the one without a change."""
     if count <= _EXACT:
@@ -60,8 +65,12 @@ def _signs(count: int) -> np.ndarray:
 
 def wilson(count: float, n: int) -> tuple[float, float]:
     """Compute the 95 % score interval of ``count`` of ``n`` answers (Wilson 1927, "Probable inference", JASA 22)."""
-    low, high = binomtest(round(count), n).proportion_ci(CONFIDENCE, method="wilson")
-    return float(low), float(high)
+    z = float(norm.ppf((1 + CONFIDENCE) / 2))
+    fraction = count / n  # also of a count that is no whole number, as of an average over scenes
+    centre = fraction + z**2 / (2 * n)
+    half = z * math.sqrt(fraction * (1 - fraction) / n + z**2 / (4 * n**2))
+    scale = 1 + z**2 / n
+    return max((centre - half) / scale, 0.0), min((centre + half) / scale, 1.0)
 
 
 def bootstrap_of_average(chosen: np.ndarray, asked: np.ndarray, seed: int = 0) -> tuple[float, float]:

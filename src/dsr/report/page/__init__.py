@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,15 @@ from dsr.pictures.canvas import HOLE_COLOUR
 from dsr.report.html_page import asset, fill, json_text, palette
 from dsr.report.page.content import links, metrics_data, problem_data, run_data, standings
 from dsr.report.page.scene_content import PictureStore, calibration_data, scene_data
-from dsr.report.shown_scenes import View
+from dsr.report.shown_scenes import View, views_of
 from dsr.report.worker_pool import WorkerPool
 from dsr.utils.files import write_text
 from dsr.utils.progress import Steps, megabytes
 
-LONGEST = 1024
-"""Default of the longer side of a picture, pixels."""
+_LONGEST = 1024
+"""Longer side of a picture, pixels, if none is given and the page has few surfaces."""
+_MOST_PIXELS = 48 * _LONGEST**2
+"""Of all surfaces of a page together, if no size is given; they take 1 to 4 bytes each."""
 _COLOUR_MAPS = {"depth": "viridis", "error": "RdBu_r", "angle": "magma"}
 _SCRIPTS = ("core.js", "values.js", "tables.js", "scenes.js", "report.js")
 
@@ -27,11 +30,14 @@ _SCRIPTS = ("core.js", "values.js", "tables.js", "scenes.js", "report.js")
 class Pictures:
     """The pictures of all scenes and the agreement of their errors, which the workers begin at once."""
 
-    def __init__(self, workers: WorkerPool, longest: int = LONGEST) -> None:
-        self.results, self.longest = workers.results, longest
-        problems = workers.results.problems()
-        self.places = [(problem, scene) for problem in problems for scene in workers.results.by_scene(problem)]
-        self.scenes: Iterator[_Encoded] = workers.map(functools.partial(_encode_scene, longest), self.places)
+    def __init__(self, workers: WorkerPool, longest: int | None = None) -> None:
+        self.results = workers.results
+        problems = self.results.problems()
+        views = [view for problem in problems for view in views_of(self.results, problem)]
+        surfaces = sum(len(view.runs) + 2 for view in views)  # with input and truth
+        self.longest = longest or min(_LONGEST, math.isqrt(_MOST_PIXELS // max(surfaces, 1)))
+        self.places = [(view.problem, view.scene) for view in views]
+        self.scenes: Iterator[_Encoded] = workers.map(functools.partial(_encode_scene, self.longest), self.places)
         self.calibration = workers.map(calibration_data, problems)
 
 
