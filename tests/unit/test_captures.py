@@ -11,7 +11,9 @@ import sys
 import zipfile
 import zlib
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import bombs
 import captures
@@ -692,13 +694,18 @@ class Toy:
 
 
 def test_other_packages_add_captures_by_an_entry_point(folder, monkeypatch, capsys):
-    monkeypatch.setattr(registry, "entry_points", lambda group: [Toy] if group == "dsr.captures" else [])
+    entry = SimpleNamespace(name="toy", value="toy:TOY", load=Toy.load)
+    monkeypatch.setattr(registry, "entry_points", lambda group: {"dsr.captures": [entry]}[group])
     registry.all_captures.cache_clear()
     (folder / "toy").touch()
     try:
         assert [pair.name for pair in find_pairs_of_folder(folder).pairs] == ["a"]
         assert main(["formats", "toy"]) == 0
         assert capsys.readouterr().out.startswith("Toy")
+        registry.all_captures.cache_clear()
+        entry.load = lambda: import_module("toy_that_is_gone")
+        with pytest.raises(ValueError, match="capture toy of another package"):
+            find_pairs_of_folder(folder)
     finally:
         registry.all_captures.cache_clear()
 
