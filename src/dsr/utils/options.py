@@ -6,6 +6,7 @@ The type says how an option is read: ``bool`` is a flag, ``Literal`` a choice, `
 
 from __future__ import annotations
 
+import contextlib
 import math
 from argparse import SUPPRESS, Namespace
 from collections import defaultdict
