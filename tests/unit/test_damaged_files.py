@@ -23,7 +23,7 @@ import pytest
 import safetensors.torch
 import torch
 from omegaconf import OmegaConf
-from scipy.io import savemat
+from single_files import KEY, READERS, read_capture, read_picture_file
 from small_results import write_result
 
 from dsr.app.entry import run_command
@@ -36,39 +36,32 @@ from dsr.data.matlab import read_variables
 from dsr.evaluation.results import load_errors, load_prediction, prediction_path, sample_path
 from dsr.evaluation.run_files import load_results, read_run
 from dsr.geometry.camera import Camera
-from dsr.io.cameras import read_any_camera, read_camera
 from dsr.io.captures.arkit import ARKITSCENES, POLYCAM
 from dsr.io.captures.record3d import RECORD3D
 from dsr.io.captures.stray import STRAY
-from dsr.io.depth_files import DEPTH_SUFFIXES, read_depth_file, write_depth_file
+from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import read_input, write_input
-from dsr.io.images import read_mask
 from dsr.io.inputs import read_picture
 from dsr.io.pairs import Pair
-from dsr.io.photos import read_photo
 from dsr.io.reading import Reading
-from dsr.io.trajectories import read_poses, read_transform
-from dsr.methods.networks.msg_net import MSGNet
+from dsr.io.trajectories import read_transform
 from dsr.methods.networks.peers.peer_network import read_tensors
 from dsr.methods.networks.trained import NETWORKS, load_msg_weights
-from dsr.methods.networks.weight_files import is_dsr_weights, load_network, save_network
+from dsr.methods.networks.weight_files import is_dsr_weights, load_network
 from dsr.methods.weights import packaged_weights
 from dsr.report.study.answers import files_of, read_all
-from dsr.report.study.key import Candidate, Key, Trial, read_key, write_key
+from dsr.report.study.key import read_key, write_key
 from dsr.report.study.study_table import read_study
 from dsr.report.surface_page import is_view
 from dsr.sample import DepthSample
 from dsr.utils.configuration import ConfigError
 from dsr.utils.console import one_line, print_error
 from dsr.utils.guards import TooLargeError, is_number, parse_json, read_limited, read_member
-from dsr.utils.torch_files import read_torch_file
 
 HUGE = "1" + "0" * 400
 NO_NUMBERS = ("true", "Infinity", HUGE, '"4"', "[]")  # as JSON; a float holds none of them
 DEEP = "[" * 100_000
 MOST = 450 << 20  # growth of memory in bytes while a file is refused; MATLAB's old files take the most
-CANDIDATES = {name: Candidate(name, name, "runs") for name in ("a", "b")}
-KEY = Key("0123", "e4", 1, 0, {"s1": Trial("simgeo", "cube", 4, "box", CANDIDATES)})
 
 
 def refusal(path, read, *arguments):
@@ -100,14 +93,6 @@ def limited():
     resource.setrlimit(resource.RLIMIT_DATA, before)
 
 
-def photo(path):
-    return read_photo(path, (8, 8))
-
-
-def capture(path):
-    return [pair.capture.photo.read() for pair in RECORD3D.frames(path).pairs]
-
-
 BOMBS = [
     (bombs.npz, "x.npz", read_depth_file),
     (bombs.npz, "x.npz", load_prediction),
@@ -115,12 +100,12 @@ BOMBS = [
     (bombs.npz, "x.npz", read_input),
     (bombs.npy_sparse, "x.npy", read_depth_file),
     (bombs.png, "x.png", read_depth_file),
-    (bombs.jpeg, "x.jpg", photo),
+    (bombs.jpeg, "x.jpg", read_picture_file),
     (bombs.tiff, "x.tiff", read_depth_file),
     (bombs.exr, "x.exr", read_depth_file),
     (bombs.mat5, "x.mat", read_variables),
     (bombs.mat73, "x.mat", read_variables),
-    (bombs.r3d, "x.r3d", capture),
+    (bombs.r3d, "x.r3d", read_capture),
 ]
 
 
@@ -193,7 +178,7 @@ def test_heic_file_of_gigabytes_is_not_read_for_its_exif_data(tmp_path):
     with (tmp_path / "photo.heic").open("wb") as file:
         file.truncate(3 << 30)
     tracemalloc.start()
-    assert refusal(tmp_path / "photo.heic", photo, tmp_path / "photo.heic")
+    assert refusal(tmp_path / "photo.heic", read_picture_file, tmp_path / "photo.heic")
     assert tracemalloc.get_traced_memory()[1] < 1 << 20
     tracemalloc.stop()
 
@@ -201,41 +186,6 @@ def test_heic_file_of_gigabytes_is_not_read_for_its_exif_data(tmp_path):
 # Readers and damages
 
 
-DEPTH = np.linspace(1, 2, 48 * 64, dtype=np.float32).reshape(48, 64)
-NOISE = np.random.default_rng(0).integers(1, 60_000, (48, 64, 3)).astype(np.uint16)
-INTRINSICS = {"width": 64, "height": 48, "fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5}
-
-
-def depth_file(path):
-    write_depth_file(path, NOISE[..., 0] if path.suffix == ".png" else DEPTH)
-
-
-def picture(path):
-    cv2.imwrite(str(path), NOISE.astype(np.uint8))
-
-
-def text(content):
-    return lambda path: path.write_text(content)
-
-
-READERS = {
-    **{f"depth{suffix}": (depth_file, read_depth_file) for suffix in DEPTH_SUFFIXES},
-    **{f"photo{suffix}": (picture, photo) for suffix in (".png", ".jpg", ".webp")},
-    "mask.png": (picture, read_mask),
-    "input.npz": (lambda path: write_input(path, torch.rand(3, 48, 64), torch.from_numpy(DEPTH)[None]), read_input),
-    "prediction.npz": (lambda path: np.savez(path, depth=DEPTH, config="{}", seconds=1.0), load_prediction),
-    "camera.json": (text(json.dumps(INTRINSICS)), read_camera),
-    "camera.txt": (text("60 0 31\n0 60 24\n0 0 1"), read_any_camera),
-    "transform.txt": (text("1 0 0 0 0 1 0 0 0 0 1 0"), read_transform),
-    "poses.txt": (text("1 0 0 0 0 1 0 0 0 0 1 0"), read_poses),
-    "weights.pth": (lambda path: torch.save({"weight": torch.rand(2000)}, path), read_torch_file),
-    "weights.safetensors": (
-        lambda path: save_network(path, MSGNet(2, "dsr"), "msg_v"), lambda path: load_network(path, NETWORKS)
-    ),
-    "x.mat": (lambda path: savemat(path, {"depth": DEPTH}, do_compression=True), read_variables),
-    "scan.r3d": (captures.record3d, capture),
-    "key.json": (lambda path: write_key(path, KEY), read_key),
-}  # fmt: skip
 DAMAGES = {
     "missing": None,
     "empty": lambda _: b"",
