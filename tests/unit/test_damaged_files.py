@@ -18,6 +18,7 @@ import bombs
 import captures
 import cv2
 import h5py
+import lightning
 import numpy as np
 import pytest
 import safetensors.torch
@@ -25,6 +26,7 @@ import torch
 from omegaconf import OmegaConf
 from single_files import KEY, READERS, read_capture, read_picture_file
 from small_results import write_result
+from torch.utils.data import DataLoader
 
 from dsr.app.entry import run_command
 from dsr.app.training_runs import read_config, read_plain_yaml
@@ -48,6 +50,7 @@ from dsr.io.trajectories import read_transform
 from dsr.methods.networks.peers.peer_network import read_tensors
 from dsr.methods.networks.trained import NETWORKS, load_msg_weights
 from dsr.methods.networks.weight_files import is_dsr_weights, load_network
+from dsr.methods.recipe import read_recipe
 from dsr.methods.weights import packaged_weights
 from dsr.report.study.answers import files_of, read_all
 from dsr.report.study.key import read_key, write_key
@@ -55,8 +58,9 @@ from dsr.report.study.study_table import read_study
 from dsr.report.surface_page import is_view
 from dsr.sample import DepthSample
 from dsr.utils.configuration import ConfigError
-from dsr.utils.console import one_line, print_error
+from dsr.utils.console import one_line, print_error, printable
 from dsr.utils.guards import TooLargeError, is_number, parse_json, read_limited, read_member
+from dsr.utils.lightning import fit, make_trainer
 
 HUGE = "1" + "0" * 400
 NO_NUMBERS = ("true", "Infinity", HUGE, '"4"', "[]")  # as JSON; a float holds none of them
@@ -467,14 +471,25 @@ def test_configuration_of_10000_nested_lists_is_refused_at_once(tmp_path):
         read_plain_yaml(path)
 
 
-@pytest.mark.parametrize("content", ["3.5", "name: tgv\nsharpness: !!set {a, b}\n"])
-def test_unusable_file_of_a_method_is_named_by_the_commands(tmp_path, capfd, content):
-    (tmp_path / "method").mkdir()
-    (tmp_path / "method" / "mine.yaml").write_text(content)
+@pytest.mark.parametrize(("content", "reason"), [
+    (b"3.5", ""), (b"name: tgv\nsharpness: !!set {a, b}\n", ""), (b"a: \x83", "UnicodeDecodeError"),
+    (b"[" * 3000, "RecursionError"),
+])  # fmt: skip
+def test_unusable_file_of_a_method_is_named(tmp_path, monkeypatch, capfd, content, reason):
+    path = tmp_path / "conf" / "method" / "mine.yaml"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(content)
+    said = refusal(path, lambda: read_recipe("mine", directories=[tmp_path / "conf"]))
+    assert reason in said
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:
-        run_command("eval", Mock(), ["--config-dir", str(tmp_path), "method=mine"])
+        run_command("eval", Mock(), ["--config-dir", str(tmp_path / "conf"), "method=mine"])
     assert ended.value.code == 2
-    assert f"{tmp_path}/method/mine.yaml: expected" in capfd.readouterr().err
+    error = capfd.readouterr().err
+    assert error.startswith("error: ")
+    assert f"{path}: expected" in error
+    assert reason in error
 
 
 # Maps, weights, archives and captures
@@ -538,6 +553,45 @@ def test_weights_without_plain_values_are_refused(tmp_path, tensor):
     assert "expected a torch file" in refusal(path, load_msg_weights, path, 4)
 
 
+class OneWeight(lightning.LightningModule):
+    """A training of one number."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(1))
+
+    def training_step(self, batch, _):
+        return (self.weight - batch).square().sum()
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), 0.1)
+
+
+@pytest.mark.parametrize("content", [{"state_dict": {}}, [1], {"epoch": 1, "global_step": 2}])
+def test_checkpoint_of_something_else_is_refused(tmp_path, content):
+    torch.save(content, tmp_path / "last.ckpt")
+    trainer = make_trainer(torch.device("cpu"), 1, 1, callbacks=[], logger=False, default_root_dir=tmp_path)
+    with pytest.raises(ValueError, match=r"last\.ckpt: expected a checkpoint of this training") as refused:
+        fit(trainer, OneWeight(), [torch.ones(1)], tmp_path / "last.ckpt")
+    assert "\n" not in str(refused.value)
+
+
+class Defective(lightning.Callback):
+    def on_train_start(self, *_):
+        raise RuntimeError("defective")
+
+
+def test_defect_of_a_callback_is_not_taken_for_a_damaged_checkpoint(tmp_path):
+    given = {"logger": False, "default_root_dir": tmp_path}
+    trainer = make_trainer(torch.device("cpu"), 1, 1, callbacks=[], **given)
+    numbers = DataLoader(torch.ones(2, 1), batch_size=None)
+    fit(trainer, OneWeight(), numbers)
+    trainer.save_checkpoint(tmp_path / "last.ckpt")
+    trainer = make_trainer(torch.device("cpu"), 2, 1, callbacks=[Defective()], **given)
+    with pytest.raises(RuntimeError, match="defective"):
+        fit(trainer, OneWeight(), numbers, tmp_path / "last.ckpt")
+
+
 def external(file, secret):
     file.create_dataset("depth", (4, 4), "f8", external=[(str(secret), 0, 128)])
 
@@ -555,7 +609,7 @@ def test_matrix_of_another_file_is_not_read(tmp_path, fill):
 
 
 def nameless(content):
-    """Take the name `abc` off the central directory's only entry of an archive."""
+    """Take the name `üc` off the central directory's only entry of an archive."""
     entry, end = content.index(b"PK\x01\x02"), content.index(b"PK\x05\x06")
     directory, tail = bytearray(content[entry : entry + 46] + content[entry + 49 : end]), bytearray(content[end:])
     struct.pack_into("<H", directory, 28, 0)
@@ -571,11 +625,15 @@ def displaced(content):
     return changed
 
 
-@pytest.mark.parametrize("damage", [nameless, displaced, lambda content: content[:-30]])
+def named_in_no_encoding(content):
+    return content.replace("ü".encode(), b"\xcf\x20")
+
+
+@pytest.mark.parametrize("damage", [nameless, displaced, named_in_no_encoding, lambda content: content[:-30]])
 def test_damaged_archive_is_refused_and_nothing_unpacked(tmp_path, damage):
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as file:
-        file.writestr("abc", b"x" * 100)
+        file.writestr("üc", b"x" * 100)
     path = tmp_path / "data.zip"
     path.write_bytes(damage(packed.getvalue()))
     refusal(path, unpack, path, tmp_path / "out", Mock())
@@ -620,12 +678,19 @@ def test_loop_of_links_among_answers_is_one_file_and_no_error(tmp_path):
     assert tmp_path / "c.json" in files_of([tmp_path])
 
 
+def test_printable_replaces_what_controls_a_terminal_or_turns_text():
+    assert printable("a\x1b[2Jb\x00\x85\u202e").replace("\N{REPLACEMENT CHARACTER}", "#") == "a#[2Jb###"
+    assert printable("Küche 日本 \u200d\n") == "Küche 日本 \u200d\n"
+
+
 def test_long_message_keeps_the_name_at_its_beginning_and_its_end(capsys):
     print_error(f"/data/camera.json: expected a number, got {'9' * 10_000} at the end")
     line = capsys.readouterr().err
     assert len(line) <= len("\n") + 1000
     assert line.startswith("error: /data/camera.json: expected a number, got 999")
     assert line.endswith("9 at the end\n")
-    assert one_line(ValueError("short\nmessage")) == "short message"
+    assert one_line(ValueError("short\nmes\x1bsage\u202e")) == "short mes#sage#".replace(
+        "#", "\N{REPLACEMENT CHARACTER}"
+    )
     print_error("a\x1b]0;title\x07b\x9bc\nd")
     assert capsys.readouterr().err == "error: a#]0;title#b#c d\n".replace("#", "\N{REPLACEMENT CHARACTER}")
