@@ -117,6 +117,14 @@ def record3d(path, compress=lzfse_block, **changes):
     return path
 
 
+def record3d_unpacked(folder):
+    """Write the members of an .r3d archive."""
+    with zipfile.ZipFile(record3d(folder.parent / "packed.r3d")) as archive:
+        archive.extractall(folder)
+    (folder.parent / "packed.r3d").unlink()
+    return folder
+
+
 def record3d_export(folder):
     """Write Record3D's export of EXR depth and photos."""
     for number in range(FRAMES):
@@ -683,3 +691,50 @@ def zed(folder, fx=700.0, **changes):
              for name, each in sections.items()]  # fmt: skip
     (folder / "SN12345.conf").write_text("\n".join(lines))
     return folder
+
+
+def tum(folder, name="{:06}".format):
+    """Write lists of TUM that name files of any names, by time."""
+    lines = {"rgb": [], "depth": [], "groundtruth": []}
+    for number in range(FRAMES):
+        stem, time = name(number), f"{95.5 + number / 8:.4f}"
+        save(folder / "rgb" / f"{stem}.png", photo(number))
+        save(folder / "depth" / f"{stem}.png", 5 * millimetres(number))
+        for kind in ("rgb", "depth"):
+            lines[kind].append(f"{time} {kind}/{stem}.png")
+        lines["groundtruth"].append(f"{time} {0.1 * number} 0 0 0 0 0 1")
+    for kind, each in lines.items():
+        (folder / f"{kind}.txt").write_text("\n".join(each) + "\n")
+    return folder
+
+
+FOLDERS = {
+    "stray": lambda folder: stray(folder, video=False),
+    "stray video": stray,
+    "record3d": lambda folder: record3d(folder / "scan.r3d"),
+    "record3d unpacked": record3d_unpacked,
+    "record3d export": record3d_export,
+    "polycam": polycam,
+    "arkitscenes": arkitscenes,
+    "scanner app": scanner_app,
+    "scannetpp": scannetpp,
+    "scannetpp deflate": lambda folder: scannetpp(folder, "deflate"),
+    "scannet": scannet,
+    "sens": lambda folder: sens(folder / "a.sens", lost=(1,)),
+    "sens raw": lambda folder: sens(folder / "b.sens", colour="raw", depth="raw", scale=5000.0),
+    "7-scenes": seven_scenes,
+    "sunrgbd": sunrgbd,
+    "replica": replica,
+    "zed": zed,
+    "open3d": open3d,
+    "tum": tum,
+    "ros 1": lambda folder: ros(folder / "scan.bag", 1),
+    "ros 1 jpeg": lambda folder: ros(folder / "scan.bag", 1, floats=True, compressed=True),
+    "ros 1 rvl": lambda folder: ros(folder / "scan.bag", 1, rvl_depth=True),
+    "ros 2": lambda folder: ros(folder / "recording", 2),
+    "ros 2 packed": lambda folder: ros(folder / "recording", 2, packed=True),
+    "ros 2 mcap": lambda folder: ros(folder / "recording", 2, plugin="MCAP"),
+    "kinect": lambda folder: kinect(folder / "scan.mkv", [photo()] * 2, [np.full(KINECT_DEPTH, 1000, np.uint16)] * 2),
+    "heic": lambda folder: heic(folder / "photo.heic", np.full(HEIC_MAP, 99, np.uint8), text=apple_text()),
+}
+"""What writes each kind of capture into a folder."""

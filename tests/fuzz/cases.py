@@ -1,29 +1,41 @@
 """Cases: a number and a seed are a reader, its files with something changed, and how reading them ends."""
 
+import contextlib
 import os
+import resource
 import shutil
+import signal
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 
-from fuzz.judging import Outcome, judge
+import torch
+
+from fuzz.commands import COMMANDS
+from fuzz.judging import Outcome, Place, judge
 from fuzz.mutations import mutate
-from fuzz.place import Place
-from fuzz.readers import READERS, Reader, reader_of
+from fuzz.readers import OF_CAPTURES, OF_FILES, OF_SETS, Reader
+
+READERS = (*OF_CAPTURES, *OF_SETS, *OF_FILES, *COMMANDS)
+_ADDRESSES = 6 << 30  # Bytes that a case may take beyond those of an idle worker, so that the machine is left alone
+_ROUND = tuple(reader for turn in range(6) for reader in READERS if reader.weight > turn)
+"""The readers of consecutive cases."""
+
+
+def reader_of(number: int) -> Reader:
+    """Return the reader of a case."""
+    return _ROUND[number % len(_ROUND)]
+
+
+def numbers_of(reader: Reader) -> list[int]:
+    """Return the numbers of the cases of a reader in the first round."""
+    return [number for number, each in enumerate(_ROUND) if each is reader]
 
 
 @dataclass(frozen=True)
 class Case:
-    """What happened in a case.
-
-    Args:
-        seed, number: what it is made from.
-        reader: name of the reader.
-        changes: what was changed in its files.
-        outcome: how it ended.
-
-    """
+    """What happened in a case: the changes of its files, and how reading them ended."""
 
     seed: int
     number: int
@@ -40,56 +52,45 @@ class Case:
 
 
 class Cases:
-    """Makes and runs cases in a folder of its own.
-
-    Args:
-        seed: decides about all cases, together with their numbers.
-        above: folder above its own; None for that of temporary files.
-
-    """
+    """Makes and runs cases in a folder of its own, below ``above`` or among temporary files."""
 
     def __init__(self, seed: int, above: Path | None = None) -> None:
         self.folder = Path(tempfile.mkdtemp(prefix="dsr-fuzz-", dir=above))
         self._seed = seed
+        self.of_valid_files: dict[str, Outcome] = {}  # by reader
         os.environ["DSR_CACHE"] = str(self.folder / "cache")
         (self.folder / "etc").mkdir()
         (self.folder / "etc" / "passwd").touch()  # ../../etc/passwd from the folder of a case's files
 
     def run(self, number: int, keep: Path | None = None) -> Case:
-        """Run a case, in the working directory, which should be an empty one.
-
-        Args:
-            number: its number.
-            keep: a folder for its files; None to delete them.
-
-        """
+        """Run a case in the working directory, which should be an empty one; ``keep`` is a new folder for its files."""
         reader, random = reader_of(number), Random(f"{self._seed}-{number}")
-        place = Place(self.folder / f"case{number}")
-        shutil.copytree(self._seeds(reader), place.input)
-        place.out.mkdir()
+        place = self._place(f"case{number}", self._seeds(reader))
         changes = mutate(random, place, lambda: self._other(random))
         if keep is not None:
             shutil.copytree(place.input, keep, symlinks=True, copy_function=_copy)
-        cache = os.environ["DSR_CACHE"]
         try:
-            outcome = judge(reader.read, place, reader.refusals)
+            outcome = judge(reader.read, place)
         finally:
-            os.environ["DSR_CACHE"] = cache
             for folder in (place.root, place.canary):
                 shutil.rmtree(folder, ignore_errors=True)
         return Case(self._seed, number, reader.name, tuple(changes), outcome)
 
-    def close(self) -> None:
-        """Remove the folder."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+    def _place(self, name: str, seeds: Path) -> Place:
+        place = Place(self.folder / name)
+        shutil.copytree(seeds, place.input)
+        place.out.mkdir()
+        return place
 
     def _seeds(self, reader: Reader) -> Path:
-        """Return the folder of a reader's valid files, which is made once."""
+        """Return the folder of a reader's valid files, which is made and read once: readers import when they read."""
         folder = self.folder / "seeds" / f"{READERS.index(reader)}"
         if not folder.is_dir():
             folder.mkdir(parents=True)
             reader.make(folder)
-            _warm_up(reader, Place(self.folder), folder)
+            place = self._place("first", folder)
+            self.of_valid_files[reader.name] = judge(reader.read, place)
+            shutil.rmtree(place.root)
         return folder
 
     def _other(self, random: Random) -> bytes:
@@ -98,15 +99,27 @@ class Cases:
         return random.choice(sorted(path for path in folder.rglob("*") if path.is_file())).read_bytes()
 
 
+def begin(seed: int, work: Path) -> None:
+    """Prepare a worker process."""
+    global _cases  # noqa: PLW0603 - of this process
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends the workers
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    torch.set_num_threads(1)
+    with contextlib.suppress(ValueError, OSError), open("/proc/self/statm") as file:  # noqa: PTH123 - Linux's
+        most = int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE") + _ADDRESSES
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    _cases = Cases(seed, work)
+    os.chdir(_cases.folder)
+
+
+def run(number: int, keep: Path | None) -> Case:
+    """Run a case in a worker process that has begun."""
+    return _cases.run(number, keep)
+
+
+_cases: Cases
+
+
 def _copy(source: str, target: str) -> str:
     """Copy a file that is one; named pipes are left out."""
     return shutil.copy2(source, target) if Path(source).is_file() else target
-
-
-def _warm_up(reader: Reader, place: Place, folder: Path) -> None:
-    """Import what a reader needs before anything is measured, by reading valid files once."""
-    first = Place(Path(tempfile.mkdtemp(prefix="first-", dir=place.root)))
-    shutil.copytree(folder, first.input)
-    first.out.mkdir()
-    judge(reader.read, first, reader.refusals)
-    shutil.rmtree(first.root, ignore_errors=True)

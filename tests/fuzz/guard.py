@@ -10,16 +10,13 @@ import sys
 import tempfile
 import types
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fuzz.place import MARK
-
+MARK = "dsr_fuzz_canary"  # A word in everything that a file could execute
 _NEVER = (
-    "os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "os.forkpty", "os.startfile", "subprocess.Popen",
-    "socket.connect", "socket.getaddrinfo", "webbrowser.open", "pty.spawn", "pickle.find_class",
-    "ftplib.connect", "http.client.connect", "urllib.Request", "smtplib.connect",
+    "os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "os.forkpty", "subprocess.Popen", "pty.spawn",
+    "socket.connect", "socket.getaddrinfo", "webbrowser.open", "pickle.find_class", "urllib.Request",
 )  # fmt: skip
 _CHANGES = (
     "os.remove", "os.rename", "os.rmdir", "os.mkdir", "os.link", "os.symlink", "os.truncate", "os.chmod", "os.chown",
@@ -28,18 +25,12 @@ _CHANGES = (
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 
 
-@dataclass
 class Watch:
-    """What was seen while a case ran.
+    """What was ``seen`` that must not be, while a case ran that may use the ``allowed`` folders."""
 
-    Args:
-        allowed: folders below which files may be written, and that no name in a file may lead out of.
-        seen: what was done that must not be.
-
-    """
-
-    allowed: tuple[str, ...]
-    seen: list[str] = field(default_factory=list)
+    def __init__(self, *allowed: Path | str) -> None:
+        self._allowed = tuple(map(_absolute, allowed))
+        self.seen: list[str] = []
 
     def look(self, event: str, arguments: tuple[Any, ...]) -> None:
         """Look at one event."""
@@ -49,24 +40,24 @@ class Watch:
             self.seen.append(f"{event}{arguments!r:.200}")
         elif event == "exec" and _mentions(arguments[0]):
             self.seen.append(f"executes code of a file ({arguments[0]!r:.100})")
-        elif (event == "open" and _writes(arguments)) or event in _CHANGES:
+        elif event in _CHANGES or (event == "open" and _writes(*arguments)):
+            self.seen += [
+                f"{event} of {path!r:.200}" for path in _paths(event, arguments) if not self._may(event, path)
+            ]
+        elif event == "open":
             for path in _paths(event, arguments):
-                if not self._may(event, path):
-                    self.seen.append(f"{event} of {path!r:.200}")
-        elif event == "open" and any(map(self._leads_out, _paths(event, arguments))):
-            self.seen.append(f"reads {arguments[0]!r:.200}, to which a name in a file leads")
-
-    def _leads_out(self, path: str) -> bool:
-        """Return whether a path begins in a folder that is read or written, and leads out of it."""
-        full = os.path.abspath(path)  # noqa: PTH100 - as below
-        return path.startswith(self.allowed) and not full.startswith(self.allowed)
+                if path.startswith(self._allowed) and not _absolute(path).startswith(self._allowed):
+                    self.seen.append(f"reads {path!r:.200}, to which a name in a file leads")
 
     def _may(self, event: str, path: str) -> bool:
         """Return whether a file may be written."""
-        full = os.path.abspath(path)  # noqa: PTH100 - without following links, and of texts that are no paths
-        if os.path.isdir(full) and event == "os.mkdir":  # noqa: PTH112
-            return True
-        return full == os.devnull or any(full.startswith(folder) for folder in self.allowed)
+        full = _absolute(path)
+        made_already = event == "os.mkdir" and os.path.isdir(full)  # noqa: PTH112 - of texts that are no paths, too
+        return made_already or full == os.devnull or full.startswith(self._allowed)
+
+
+def _absolute(path: Path | str) -> str:
+    return os.path.abspath(path)  # noqa: PTH100 - without following links, and of texts that are no paths
 
 
 def _paths(event: str, arguments: tuple[Any, ...]) -> list[str]:
@@ -81,19 +72,16 @@ def _paths(event: str, arguments: tuple[Any, ...]) -> list[str]:
     return paths
 
 
-def _writes(arguments: tuple[Any, ...]) -> bool:
+def _writes(_: Any, mode: Any, flags: Any) -> bool:
     """Return whether the arguments of the event ``open`` are those of writing."""
-    _, mode, flags = arguments
     return any(letter in mode for letter in "wax+") if isinstance(mode, str) else bool((flags or 0) & _WRITING)
 
 
 def _mentions(code: Any) -> bool:
-    """Return whether code has the mark in one of its names or constants."""
-    if not isinstance(code, types.CodeType):
-        return False
-    return any(MARK in each for each in (*code.co_names, *code.co_consts) if isinstance(each, str)) or any(
-        _mentions(each) for each in code.co_consts
-    )
+    """Return whether code has the mark in one of its names or constants, or in the code inside it."""
+    if isinstance(code, str):
+        return MARK in code
+    return isinstance(code, types.CodeType) and any(map(_mentions, (*code.co_names, *code.co_consts)))
 
 
 class _Finder:
@@ -117,20 +105,16 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
 
 @contextlib.contextmanager
 def watching(*folders: Path) -> Iterator[Watch]:
-    """Return a context in which is watched what the process does; it may write below some folders.
-
-    Temporary files and the cache of dsr are always allowed.
-    """
+    """Watch in the block what the process does; it may write below some folders, the cache and temporary folders."""
     global _current, _installed  # noqa: PLW0603 - a hook is one for the process
     if not _installed:
         sys.addaudithook(_hook)
         sys.meta_path.insert(0, _Finder)
         _installed = True
-    more = [os.environ[name] for name in ("DSR_CACHE",) if name in os.environ]
     temporary = [f"{tempfile.gettempdir()}/{beginning}" for beginning in ("tmp", ".dsr-")]
-    watch = Watch(tuple(os.path.abspath(each) for each in (*folders, *more, *temporary)))  # noqa: PTH100
-    _current = watch
+    cache = [os.environ[name] for name in ("DSR_CACHE",) if name in os.environ]
+    _current = Watch(*folders, *temporary, *cache)
     try:
-        yield watch
+        yield _current
     finally:
         _current = None

@@ -5,7 +5,6 @@ import gc
 import io
 import os
 import re
-import resource
 import signal
 import sys
 import tempfile
@@ -18,13 +17,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from dsr.utils.console import one_line, printable
-from fuzz.guard import watching
-from fuzz.place import Place
+from fuzz.guard import MARK, watching
 
 SECONDS, MEGABYTES = 20.0, 2000.0  # Limits of a case: seconds of computing, and memory
 _WAITING = 60.0  # Seconds that a case may take on a machine that does much else
 _LONGEST_LINE = 1000
 _SHORTEST_NAME = 3  # Names of fewer letters are found in any message
+REFUSALS = (ValueError, OSError)  # What the commands turn into a line
 _SILENT = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
 """Warnings that Python does not show to users."""
 
@@ -46,16 +45,30 @@ class _TooLongError(BaseException):
 
 
 @dataclass(frozen=True)
+class Place:
+    """The folder of a case, with the files that are read in ``input``; commands write to ``out``."""
+
+    root: Path
+
+    @property
+    def input(self) -> Path:
+        """The folder of the files that are read."""
+        return self.root / "input"
+
+    @property
+    def out(self) -> Path:
+        """The folder that a command may write to."""
+        return self.root / "out"
+
+    @property
+    def canary(self) -> Path:
+        """A folder that only code from a file makes; relative, so that the files are the same wherever a case runs."""
+        return Path(MARK)
+
+
+@dataclass(frozen=True)
 class Outcome:
-    """How a case ended.
-
-    Args:
-        kind: with a value, with a refusal of a line for each problem, or neither.
-        text: the refusal, or what is wrong.
-        seconds: that it took.
-        megabytes: by which the memory grew at most.
-
-    """
+    """How a case ended: with a value, with a refusal of a line for each problem, or neither."""
 
     kind: Literal["value", "refusal", "unclean"]
     text: str
@@ -63,15 +76,8 @@ class Outcome:
     megabytes: float
 
 
-def judge(read: Callable[[Place], Any], place: Place, refusals: tuple[type[BaseException], ...]) -> Outcome:
-    """Run a reader on the files of a place.
-
-    Args:
-        read: the reader.
-        place: the folders of the case.
-        refusals: exceptions that the commands turn into a line.
-
-    """
+def judge(read: Callable[[Place], Any], place: Place) -> Outcome:
+    """Run a reader on the files of a place."""
     names = _names(place)
     before = _begin_memory()
     started = time.process_time()
@@ -89,19 +95,22 @@ def judge(read: Callable[[Place], Any], place: Place, refusals: tuple[type[BaseE
         except RefusedError as refusal:
             lines = refusal.lines
             problems += [] if lines else ["ends with exit code 2 without a line"]
-        except refusals as error:
+        except REFUSALS as error:
             lines = [one_line(error)]
-            problems += _of_chain(error)
+            if _lacked_memory(error):
+                problems.append(f"refused only after asking for the memory that the file claims: {error!s:.200}")
         except _TooLongError as error:
             problems.append(f"takes longer than {SECONDS:g} s, or waits: {_where(error)}")
         except BaseException as error:
             cause = error.__cause__ or error if isinstance(error, EscapedError) else error
-            problems.append(f"{type(cause).__name__}: {str(cause)[:300]} {_where(cause)}")
-    seconds, megabytes = time.process_time() - started, _end_memory(before)
+            problems.append(f"{type(cause).__name__}: {cause!s:.300} {_where(cause)}")
+    seconds, megabytes = time.process_time() - started, max(0.0, _status("VmHWM") - before)
+    left = sorted(path.name for path in place.root.iterdir() if path.name not in ("input", "out"))
+    left += [MARK] if place.canary.exists() else []
     problems += [f"does what a reader must not: {each}" for each in watch.seen[:3]]
-    problems += [f"leaves {name!r} beside its folders" for name in place.strangers()]
+    problems += [f"leaves {name!r} beside its folders" for name in left]
     problems += [f"warns: {each.message!s:.200}" for each in reported if not issubclass(each.category, _SILENT)][:2]
-    problems += [f"prints {printed[0]:.200}"] if printed else []
+    problems += [f"prints {each:.200}" for each in printed]
     problems += [f"takes {megabytes:.0f} MB"] if megabytes > MEGABYTES else []
     for line in lines:
         problems += _wrong_with(line, names)
@@ -121,23 +130,19 @@ def _wrong_with(line: str, names: Sequence[str]) -> list[str]:
 
 
 def _names(place: Place) -> list[str]:
-    """Return the names of the files and folders of a case, in which a refusal must find one."""
+    """Return the names of the files and folders of a case, one of which a refusal must have."""
     found = {place.input.name + "/", str(place.input), str(place.out)}
     for folder, folders, files in os.walk(place.input):
-        found.update(name for name in (*folders, *files) if len(name) >= _SHORTEST_NAME)
-        found.update(Path(name).stem for name in files if len(Path(name).stem) >= _SHORTEST_NAME)
+        found.update((*folders, *files, *(Path(name).stem for name in files)))
         found.add(folder)
-    return sorted(found)
+    return sorted(name for name in found if len(name) >= _SHORTEST_NAME)
 
 
-def _of_chain(error: BaseException) -> list[str]:
+def _lacked_memory(error: BaseException | None) -> bool:
     """Return whether an error is only that there was no memory for what a file claims."""
-    seen: BaseException | None = error
-    while seen is not None:
-        if isinstance(seen, MemoryError):
-            return [f"refused only after asking for the memory that the file claims: {str(error)[:200]}"]
-        seen = seen.__cause__ or seen.__context__
-    return []
+    while error is not None and not isinstance(error, MemoryError):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _where(error: BaseException) -> str:
@@ -194,12 +199,7 @@ def _begin_memory() -> float:
     gc.collect(0)
     with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as file:  # noqa: PTH123 - Linux's
         file.write("5")
-    return _status("VmRSS") or _highest()
-
-
-def _end_memory(before: float) -> float:
-    """Return by how many MB the memory grew at most."""
-    return max(0.0, (_status("VmHWM") or _highest()) - before)
+    return _status("VmRSS")
 
 
 def _status(key: str) -> float:
@@ -208,7 +208,3 @@ def _status(key: str) -> float:
         found = re.search(rf"{key}:\s+(\d+) kB", file.read())
         return int(found[1]) / 1e3 if found else 0.0
     return 0.0
-
-
-def _highest() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3

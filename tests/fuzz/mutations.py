@@ -1,23 +1,24 @@
 """What happens to valid files in a case: their bytes, what they hold, and what lies in their place."""
 
-import contextlib
-import functools
+import io
 import os
 import shutil
 import struct
+import tarfile
+import warnings
+import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
-from fuzz import containers, texts, values
-from fuzz.place import Place
+import numpy as np
 
-_YAML = (".yaml", ".yml")
+from fuzz.guard import MARK
+from fuzz.judging import Place
+from fuzz.texts import mutate_structured, mutate_text, pickled
+
 _PICKLED = (".pth", ".ckpt", ".npy", ".npz", ".mat", ".safetensors", ".r3d", ".caffemodel", ".depth", ".exr", ".tiff")
-_KINDS = (
-    "cut off", "flipped bits", "overwritten", "inserted", "deleted", "integer", "integer", "swapped", "noise",
-)  # fmt: skip
-"""Of what happens to bytes."""
 _INTEGERS = (0, 1, 2, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0xFFFFFFFE, 100000)
 _SPARSE = 2200 << 20  # Size in bytes of files that take no room on the disk
 _ANOTHER = ("../../etc/passwd", "/etc/passwd", "/dev/zero", "/dev/stdin", "/proc/self/mem", ".", "nowhere")
@@ -25,31 +26,52 @@ _NAMES = (
     b"\xff\xfe%s", b"-%s", b" %s", b"%s\n", b"a" * 200 + b"%s", b"\x1b[31m%s", b"%s.txt", b"=%s", b"'%s'", b"..%s",
     b"\xe2\x80\xae%s",
 )  # fmt: skip
+_SHAPES = (
+    "()", "(0,)", "(0, 5)", "(-1, 4)", "(10**9, 10**9)", "(1000000000, 1000000000)", "(40000, 40000)", "(2, 3)",
+    "(1,) * 40", "(3.0, 4)", "(True, 4)", "'x'", "(12, 16, 1)", "(192,)", "(16, 12)", "(" + "1, " * 70 + ")",
+    "(9223372036854775807, 2)",
+)  # fmt: skip
+_TYPES = (
+    "'|O'", "'<f8'", "'<f2'", "'>f4'", "'|u1'", "'<c16'", "'<M8[s]'", "'|S5'", "'<U9'", "[('a', '<f4'), ('b', '|O')]",
+    "'|b1'", "'|V4'", "'<f16'", "'x'", "None", "'<i8'", "[('a', '<f4', (100000, 100000))]", "'|S2000000000'",
+    "(" * 50 + ")" * 50, f"__import__('os').mkdir({MARK!r})",
+)  # fmt: skip
+_MEMBERS = ("../" * 6 + "tmp/x", f"{MARK}/x", "..\\x", "", "a" * 300, "%s\0", "./%s", "/%s", "extra.npy")
+_LIES = (
+    (8, "<H", 1), (8, "<H", 0x41), (10, "<H", 99), (10, "<H", 12), (16, "<I", 7), (20, "<I", 0xFFFFFFFE),
+    (20, "<I", 1), (24, "<I", 0xFFFFFFFE), (24, "<I", 1), (24, "<I", 0), (28, "<H", 0xFFFF), (42, "<I", 0xFFFFFFF0),
+    (42, "<I", 9),
+)  # fmt: skip
+"""Place, form and number in an entry of a ZIP file's directory."""
+_KINDS = (
+    tarfile.REGTYPE, tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.CHRTYPE, tarfile.FIFOTYPE, tarfile.DIRTYPE,
+    tarfile.GNUTYPE_SPARSE, b"9",
+)  # fmt: skip
+_BLOCK = 1 << 24  # Bytes of zeros; some hundred of them are packed into a few MB
+_MOST = 1 << 26  # Bytes in an archive, unpacked, that may be changed once more
 
 
 def mutate(random: Random, place: Place, other: Callable[[], bytes]) -> list[str]:
-    """Change the files of a place, and return what was changed, for people.
-
-    Args:
-        random: decides everything.
-        place: the folders, with valid files.
-        other: returns the content of a file of another reader.
-
-    """
+    """Change the files of a place, or put the content of another reader's in one, and return what was changed."""
     done = []
     for _ in range(random.choice((1, 1, 1, 1, 2, 3))):
         files = sorted(path for path in place.input.rglob("*") if _is_plain(path))
         if not files:
             break
-        path = random.choice(_favoured(random, files))
+        suffix = random.choice(sorted({path.suffix for path in files}))  # many pictures don't hide one description
+        path = random.choice([path for path in files if path.suffix == suffix])
         pick = random.random()
         if pick < 0.12:
             done.append(_replace_in_folder(random, path, place))
-        elif pick < 0.16:
-            path.write_bytes(other())
-            done.append(f"{path.name}: a file of another kind")
+            continue
+        if pick < 0.16:
+            kind, content = "a file of another kind", other()
+        elif suffix in _PICKLED and pick < 0.2:
+            kind, content = "a pickle", pickled(random, place.canary)
         else:
-            done.append(_change_content(random, path, place.canary))
+            kind, content = _change(random, suffix, path.read_bytes(), place.canary)
+        path.write_bytes(content)
+        done.append(f"{path.name}: {kind}")
     return done
 
 
@@ -58,62 +80,30 @@ def _is_plain(path: Path) -> bool:
     return path.is_file() and not path.is_symlink() and path.stat().st_size < _SPARSE
 
 
-def _favoured(random: Random, files: list[Path]) -> list[Path]:
-    """Return the files of one suffix, so that many pictures do not hide the one description of them."""
-    suffix = random.choice(sorted({path.suffix for path in files}))
-    return [path for path in files if path.suffix == suffix]
-
-
-def _change_content(random: Random, path: Path, canary: Path) -> str:
-    """Change what is in a file."""
-    content = path.read_bytes()
-    if path.suffix in _PICKLED and random.random() < 0.06:
-        path.write_bytes(values.pickled(random, canary, inside=random.random() < 0.5))
-        return f"{path.name}: a pickle"
-    kind, changed = change(random, path.suffix, content, canary)
-    path.write_bytes(changed)
-    return f"{path.name}: {kind}"
-
-
-def change(random: Random, suffix: str, content: bytes, canary: Path) -> tuple[str, bytes]:
+def _change(random: Random, suffix: str, content: bytes, canary: Path) -> tuple[str, bytes]:
     """Return the name of a mutation of a file's content, and its result."""
     if random.random() < 0.3:
         return _change_bytes(random, content)
-    text = _as_text(content)
-    if text is not None:
-        json, yaml = suffix == ".json" or text[:1] in "{[", suffix in _YAML
-        how = texts.mutate_json if json else texts.mutate_yaml if yaml else texts.mutate_text
-        return "JSON" if json else "YAML" if yaml else "text", how(random, text, canary)
-    return _change_binary(random, suffix, content, canary)
-
-
-def _change_binary(random: Random, suffix: str, content: bytes, canary: Path) -> tuple[str, bytes]:
-    """Return the name of a mutation that knows the format of bytes, and its result."""
     if content[:6] == b"\x93NUMPY":
-        return "array", containers.mutate_npy(random, content, canary)
+        return "array", _change_array(random, content, canary)
     if content[:4] == b"PK\3\4":
-        unpacked = {"blocks": (10,)} if suffix == ".zip" else {}  # what is unpacked to the disk may be large
-        member = functools.partial(_member, random, canary)
-        return "archive", containers.mutate_zip(random, content, canary, member, **unpacked)
+        return "archive", _change_zip(random, content, canary, on_disk=suffix == ".zip")
     if content[:2] == b"\x1f\x8b" or content[257:262] == b"ustar":
-        return "archive", containers.mutate_tar(random, content, canary)
-    return _change_bytes(random, content)
+        return "archive", _another_tar(random, packed=content[:2] == b"\x1f\x8b")
+    return _change_text(random, suffix, content)
 
 
-def _member(random: Random, canary: Path, name: str, content: bytes) -> bytes:
-    """Return the changed content of an archive's member; ``data.pkl`` of torch may become another pickle."""
-    if name.endswith("data.pkl") and random.random() < 0.5:
-        return values.pickled(random, canary, inside=random.random() < 0.5)
-    suffix = Path(name).suffix
-    return change(random, suffix if suffix or name != "metadata" else ".json", content, canary)[1]
-
-
-def _as_text(content: bytes) -> str | None:
-    """Return the text of a file; None for bytes of no text."""
-    with contextlib.suppress(UnicodeDecodeError):
+def _change_text(random: Random, suffix: str, content: bytes) -> tuple[str, bytes]:
+    """Return the name of a mutation of a text and its result; bytes that are none are changed as such."""
+    try:
         text = content.decode()
-        return text if text and "\0" not in text else None
-    return None
+    except UnicodeDecodeError:
+        text = ""
+    if not text or "\0" in text:
+        return _change_bytes(random, content)
+    if suffix in (".yaml", ".json") or text[:1] in "{[":
+        return "values", mutate_structured(random, text, of_yaml=suffix == ".yaml")
+    return "text", mutate_text(random, text)
 
 
 def _change_bytes(random: Random, content: bytes) -> tuple[str, bytes]:
@@ -123,47 +113,147 @@ def _change_bytes(random: Random, content: bytes) -> tuple[str, bytes]:
         return "bytes", b"\0"
     changed = bytearray(content)
     at, other = random.randrange(min(size, random.choice((16, 64, 512, size)))), random.randrange(size)
-    kind = random.choice(_KINDS)
+    kind = random.choice(("cut off", "flipped", "overwritten", "inserted", "deleted", "integer", "integer", "noise"))
     if kind == "cut off":
         del changed[other:]
-    elif kind == "flipped bits":
+    elif kind == "flipped":
         for _ in range(random.choice((1, 1, 3, 30))):
             changed[random.randrange(size)] ^= 1 << random.randrange(8)
     elif kind == "overwritten":
         length = min(random.choice((1, 4, 16, 200, size)), size - at)
-        changed[at : at + length] = random.choice((b"\0", b"\xff", bytes([random.randrange(256)]))) * length
+        changed[at : at + length] = random.choice((b"\0", b"\xff", random.randbytes(1))) * length
     elif kind == "inserted":
         changed[at:at] = random.choice((random.randbytes(20), b"\0" * 300, content[:50], b"\xff" * 4))
     elif kind == "deleted":
         del changed[at : at + random.choice((1, 2, 9, 100, 1000))]
     elif kind == "integer":
         form = random.choice(("<I", ">I", "<H", ">H", "<Q"))
-        number = random.choice(_INTEGERS) % (1 << 8 * struct.calcsize(form))
-        changed[at : at + struct.calcsize(form)] = struct.pack(form, number)
-    elif kind == "swapped":
-        changed[at : at + 64], changed[other : other + 64] = changed[other : other + 64], changed[at : at + 64]
+        length = struct.calcsize(form)
+        changed[at : at + length] = struct.pack(form, random.choice(_INTEGERS) % (1 << 8 * length))
     else:
         changed = bytearray(random.choice((b"", random.randbytes(min(size, 5000)), content + b"\0" * 1000)))
     return f"{kind} at {at}", bytes(changed)
 
 
+def _change_array(random: Random, content: bytes, canary: Path) -> bytes:
+    """Return an ``.npy`` file with a pickle, or with a header that says something else."""
+    try:
+        array = np.load(io.BytesIO(content), allow_pickle=False)
+    except Exception:  # it is damaged already
+        return content[: len(content) // 2]
+    if random.random() < 0.2:
+        return _header("'|O'", "(1,)") + pickled(random, canary)
+    descr, shape = repr(np.lib.format.dtype_to_descr(array.dtype)), repr(array.shape)
+    order = random.choice(("True", "None", "0", "'x'", "False, 'x': 1"))
+    headers = (
+        _header(random.choice(_TYPES), shape),
+        _header(descr, random.choice(_SHAPES)),
+        _header(descr, random.choice(_SHAPES)),
+        _header(descr, shape, order),
+        _header(descr, shape, version=random.choice((2, 3, 4, 9))),
+    )
+    return random.choice(headers) + array.tobytes()
+
+
+def _header(descr: str, shape: str, order: str = "False", version: int = 1) -> bytes:
+    """Return the header of an ``.npy`` file that says anything."""
+    text = f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY" + bytes([version, 0]) + struct.pack("<H" if version == 1 else "<I", len(text)) + text
+
+
+def _change_zip(random: Random, content: bytes, canary: Path, *, on_disk: bool) -> bytes:
+    """Return an archive with a member changed, renamed, added, left out or huge, or with lies in its directory."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            if sum(each.file_size for each in archive.infolist()) > _MOST:  # an earlier change has blown it up
+                return content[: len(content) // 2]
+            members = [(each.filename, archive.read(each)) for each in archive.infolist()]
+    except Exception:  # it is damaged already
+        return content[: len(content) // 2]
+    if not members:
+        return b""
+    at, kind, blocks = random.randrange(len(members)), random.randrange(12), 0
+    name, inner = members[at]
+    if kind <= 4:
+        members[at] = (name, _change_member(random, name, inner, canary))
+    elif kind <= 6:
+        members[at] = (random.choice(_MEMBERS).replace("%s", name), inner)
+    elif kind == 7:
+        del members[at]
+    elif kind == 8:
+        members.append((name, _change_member(random, name, inner, canary)))  # a second one of the name
+    elif kind == 9:
+        blocks = 10 if on_disk else random.choice((100, 200))  # what is unpacked to the disk may be large
+    packed = _zipped(members, random.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)), at if blocks else -1, blocks)
+    return _lying(random, packed) if kind >= 10 else packed
+
+
+def _change_member(random: Random, name: str, content: bytes, canary: Path) -> bytes:
+    """Return the changed content of an archive's member; ``data.pkl`` of torch may become another pickle."""
+    if name.endswith("data.pkl") and random.random() < 0.5:
+        return pickled(random, canary)
+    return _change(random, Path(name).suffix, content, canary)[1]
+
+
+def _zipped(members: list[tuple[str, bytes]], how: int, huge: int, blocks: int) -> bytes:
+    """Return an archive; some GB of zeros follow the content of the member number ``huge``, packed as ever the same."""
+    file = io.BytesIO()
+    with warnings.catch_warnings(), zipfile.ZipFile(file, "w", how) as archive:
+        warnings.simplefilter("ignore")  # of names that are there twice
+        for number, (name, inner) in enumerate(members):
+            info = zipfile.ZipInfo(name)
+            if number != huge:
+                archive.writestr(info, inner, compress_type=how)
+                continue
+            packer = zlib.compressobj(9, wbits=-15)
+            start = packer.compress(inner) + packer.flush(zlib.Z_FULL_FLUSH)
+            block = packer.compress(bytes(_BLOCK)) + packer.flush(zlib.Z_FULL_FLUSH)
+            archive.writestr(info, start + block * blocks + packer.flush(), compress_type=zipfile.ZIP_STORED)
+            info.compress_type, info.file_size = zipfile.ZIP_DEFLATED, len(inner) + _BLOCK * blocks
+    return file.getvalue()
+
+
+def _lying(random: Random, content: bytes) -> bytes:
+    """Return an archive whose directory says something else of one member."""
+    changed = bytearray(content)
+    at, local = changed.rfind(b"PK\1\2"), changed.find(b"PK\3\4")
+    if at < 0 or local < 0:
+        return content
+    place, form, number = random.choice(_LIES)
+    struct.pack_into(form, changed, at + place, number)
+    if random.random() < 0.5 and place in (8, 10, 16, 20, 24):
+        struct.pack_into(form, changed, local + place - 2, number)
+    return bytes(changed)
+
+
+def _another_tar(random: Random, *, packed: bool) -> bytes:
+    """Return an archive with a member that leads outside, is no file, or says another size."""
+    file = io.BytesIO()
+    with tarfile.open(fileobj=file, mode="w:gz" if packed else "w") as tar:
+        for name in ("set/a", random.choice(("../x", MARK, "a/../../x", "set/b", "C:/x", "", "x" * 300, "set/a/b"))):
+            member = tarfile.TarInfo(name)
+            member.type = random.choice(_KINDS)
+            member.linkname = random.choice(("../../etc/passwd", "/etc/passwd", "set/a", name, "", "set"))
+            member.mode, member.size = 0o777, random.choice((0, 5, 5))
+            tar.addfile(member, io.BytesIO(b"12345"))
+    changed = file.getvalue()
+    return changed[: random.randrange(len(changed))] if random.random() < 0.3 else changed
+
+
 def _replace_in_folder(random: Random, path: Path, place: Place) -> str:
     """Put something else in a file's place, or the file in another."""
-    kind = random.choice((*_PLACES, "folder"))
-    if kind == "folder" and path.parent != place.input:
-        folder = path.parent
-        shutil.rmtree(folder)
-        if random.random() < 0.5:
-            folder.write_bytes(b"no folder")
-        return f"{folder.name}/: no folder"
+    kind = random.choice(("missing", "directory", "loop", "fifo", "link", "empty", "name", "sparse", "no folder"))
     if kind == "name":
         name = os.fsdecode((random.choice(_NAMES) % os.fsencode(path.name))[:250])
         path.rename(path.with_name(name))
         return f"{path.name}: another name, {name[:60]!r}"
     if kind == "sparse":
         os.truncate(path, _SPARSE)
-        return f"{path.name}: 2.2 GB"
-    path.unlink()
+    elif kind == "no folder" and path.parent != place.input:
+        shutil.rmtree(path.parent)
+        path.parent.write_bytes(b"no folder")
+    else:
+        path.unlink()
     if kind == "directory":
         path.mkdir()
     elif kind == "loop":
@@ -171,15 +261,7 @@ def _replace_in_folder(random: Random, path: Path, place: Place) -> str:
     elif kind == "fifo":
         os.mkfifo(path)
     elif kind == "link":
-        target = random.choice(_ANOTHER)
-        path.symlink_to(target)
-        return f"{path.name}: a link to {target}"
+        path.symlink_to(random.choice(_ANOTHER))
     elif kind == "empty":
         path.touch()
     return f"{path.name}: {kind}"
-
-
-_PLACES = (
-    "missing", "missing", "directory", "directory", "loop", "fifo", "fifo", "link", "link", "empty", "name", "name",
-    "sparse",
-)  # fmt: skip

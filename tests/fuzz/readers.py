@@ -1,68 +1,79 @@
-"""The readers of other people's files: what makes valid files, and what reads them as the commands do."""
+"""All readers of other people's files: what makes valid files, and what reads them as the commands do."""
 
 import contextlib
+import functools
+import importlib.util
 import io
+import json
 import os
-import re
+import tarfile
 import tempfile
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
+from unittest import mock
 
 import captures
+import data_set_files
+import numpy as np
 import realsense
+import single_files
+import torch
+from PIL import Image
+from small_files import written
+from small_lpips import random_trunk
 
 from dsr.cli import main
-from fuzz import run_seeds, seeds
-from fuzz.judging import EscapedError, RefusedError
-from fuzz.place import Place
-
-_SUFFIXES = (".png", ".jpg", ".heic", ".tiff", ".npy", ".npz", ".pfm", ".exr", ".depth", ".json", ".txt")
-_LIBRARY = (ValueError, OSError)  # What the commands turn into a line
+from dsr.data.download.collections import Collection, Item
+from dsr.data.download.fetching import state, unpack, verify
+from dsr.data.folder import Folder
+from dsr.data.ibims import IBims
+from dsr.data.nyu import NYU
+from dsr.data.tofmark import ToFMark
+from dsr.evaluation.scenes import failure_line
+from dsr.io.cameras import read_any_camera
+from dsr.io.depth_files import DEPTH_SUFFIXES, write_depth_file
+from dsr.io.trajectories import read_poses
+from dsr.methods.classical.shape_from_shading import read_foreground
+from dsr.methods.networks.msg_net import MSGNet
+from dsr.methods.networks.peers.local_filters import SVLRM
+from dsr.methods.networks.peers.peer_network import load_peer
+from dsr.methods.networks.trained import load_msg_weights
+from dsr.metrics.lpips import load_lpips
+from dsr.utils.progress import Progress
+from fuzz.judging import REFUSALS, EscapedError, Place, RefusedError
 
 
 @dataclass(frozen=True)
 class Reader:
-    """One kind of files.
+    """One kind of files: what writes valid ones into a folder, and what reads them; of each round it gets some cases.
 
-    Args:
-        name: shown in counts.
-        make: writes valid files into a folder.
-        read: reads them as a command does.
-        weight: how many cases it gets of each round; 1 for those that take long.
-        refusals: exceptions that the commands turn into a line.
-
+    A reader that takes long, or whose files do, has the weight 1.
     """
 
     name: str
     make: Callable[[Path], Any]
     read: Callable[[Place], Any]
-    weight: int = 4
-    refusals: tuple[type[BaseException], ...] = _LIBRARY
+    weight: int = 3
 
 
-def command(*arguments: object) -> None:
-    """Run ``dsr`` in this process.
+@functools.cache
+def unit(name: str) -> ModuleType:
+    """Return the module of a unit test, for what it writes files with."""
+    path = Path(__file__).resolve().parents[1] / "unit" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(f"fuzz_{name}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
-    Raises:
-        RefusedError: it ends with exit code 2.
 
-    """
-    _run(lambda: main([str(each) for each in arguments]), faulty=arguments[0] == "doctor")
-
-
-def _run(call: Callable[[], Any], *, faulty: bool = False) -> None:
-    """Run what returns an exit code or exits.
-
-    Args:
-        call: what to run.
-        faulty: whether exit code 1 says that a scene has a problem.
-
-    Raises:
-        RefusedError: it ends with exit code 2.
-
-    """
+def run(call: Callable[[], Any], *, faulty: bool = False) -> None:
+    """Run what returns an exit code or exits; ``faulty``: exit code 1 says that a scene has a problem."""
     errors = io.StringIO()
     with contextlib.redirect_stderr(errors):
         try:
@@ -77,361 +88,238 @@ def _run(call: Callable[[], Any], *, faulty: bool = False) -> None:
         raise AssertionError(f"ends with exit code {code}: {errors.getvalue()[-300:]}")
 
 
-def _upsample(*options: str) -> Callable[[Place], None]:
-    """Return what reads pictures without computing; names of files in the options end in a suffix."""
+def command(*arguments: object) -> None:
+    """Run ``dsr`` in this process."""
+    run(lambda: main([str(each) for each in arguments]), faulty=arguments[0] == "doctor")
+
+
+def upsample(*options: str) -> Callable[[Place], None]:
+    """Return what reads the input as ``dsr upsample`` does, without computing; ``{}`` in options is its folder."""
 
     def read(place: Place) -> None:
-        given = [str(place.input / each) if Path(each).suffix in _SUFFIXES else each for each in options]
-        command("upsample", *given, "-o", place.out, "--dry-run")
+        given = [each.format(place.input) for each in options]
+        first = [] if "--rgb" in options else [place.input]
+        command("upsample", *first, *given, "-o", place.out, "--dry-run")
 
     return read
 
 
-def _pair(depth: str, *more: str, rgb: str = "photo.png") -> Callable[[Place], None]:
-    return _upsample("--rgb", rgb, "--depth", depth, *more)
+# Captures and pictures
 
 
-def _recording(*options: str) -> Callable[[Place], None]:
-    """Return what reads a folder of pictures or a capture."""
+def pictures(folder: Path) -> None:
+    """Write photos, depth maps and confidence maps of all formats."""
+    photos = (".jpg", ".jpeg", ".tiff", ".bmp", ".webp", ".ppm", ".png")
+    for number, (suffix, suffix_lr) in enumerate(zip(photos, DEPTH_SUFFIXES, strict=True)):
+        captures.save(folder / "rgb" / f"{number}{suffix}", captures.photo(number))
+        maps = {"depth": captures.depth(number).astype(np.float32), "conf": (captures.levels() / 2).astype(np.float32)}
+        if suffix_lr == ".png":
+            maps = {"depth": captures.millimetres(number), "conf": (captures.levels() > 0).astype(np.uint16)}
+        for kind, values in maps.items():
+            (folder / kind).mkdir(exist_ok=True)
+            write_depth_file(folder / kind / f"{number}{suffix_lr}", values)
 
-    def read(place: Place) -> None:
-        command("upsample", place.input, "-o", place.out, "--dry-run", *options)
 
-    return read
+def rig(folder: Path) -> None:
+    """Write a photo with EXIF data, and a depth map of another camera with mask and confidence."""
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 28
+    exif[0x0112] = 1
+    Image.fromarray(captures.photo()).save(folder / "photo.jpg", exif=exif, quality=90)
+    captures.save(folder / "depth.png", captures.millimetres())
+    captures.save(folder / "mask.png", np.full(captures.SIZE_LR, 255, np.uint8))
+    captures.save(folder / "confidence.png", captures.levels())
+    camera = {"width": 16, "height": 12, "fx": 12.5, "fy": 12.7, "cx": 7.4, "cy": 5.6}
+    (folder / "camera.json").write_text(json.dumps(CAMERA))
+    (folder / "ir.json").write_text(json.dumps({**camera, "depth_unit": 0.001, "range_type": "orthogonal"}))
+    (folder / "extrinsics.txt").write_text("1 0 0 0.01\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
 
 
-def _zip(place: Place) -> None:
+CAMERA = {"width": 64, "height": 48, "fx": 50.0, "fy": 51.0, "cx": 31.0, "cy": 24.0}
+_RIG = ("--rgb", "{}/photo.jpg", "--depth", "{}/depth.png", "--camera", "{}/camera.json", "--depth-camera",
+        "{}/ir.json", "--extrinsics", "{}/extrinsics.txt", "--mask", "{}/mask.png", "--confidence",
+        "{}/confidence.png", "--min-confidence", "0.5")  # fmt: skip
+_PICTURES = ("--rgb", "{}/rgb", "--depth", "{}/depth", "--confidence", "{}/conf", "--min-confidence", "0.5")
+
+
+def colmap(folder: Path, write: str, *, depth: bool) -> None:
+    """Write photos with a sparse model of COLMAP, with depth maps or with points alone."""
+    models = unit("test_format_colmap")
+    for number in range(models.FRAMES):
+        captures.save(folder / "images" / f"{number:03}.png", captures.photo(number))
+        if depth:
+            captures.save(folder / "depth" / f"{number:03}.png", captures.millimetres(number))
+    getattr(models, write)(folder / "sparse" / "0", "OPENCV", models.NAMES, points=not depth)
+
+
+def zipped(folder: Path) -> None:
+    """Write a ZIP file of an export of 3D Scanner App."""
+    with tempfile.TemporaryDirectory() as place, zipfile.ZipFile(folder / "scan.zip", "w") as archive:
+        for path in sorted(captures.scanner_app(Path(place) / "scan").iterdir()):
+            archive.write(path, f"scan/{path.name}", zipfile.ZIP_DEFLATED)
+
+
+def read_zipped(place: Place) -> None:
     """Read a ZIP file, which is unpacked into the folder of temporary files."""
-    before, tempfile.tempdir = tempfile.tempdir, str(place.out)
-    try:
+    with mock.patch.object(tempfile, "tempdir", str(place.out)):
         command("upsample", place.input / "scan.zip", "-o", place.out / "results", "--dry-run")
-    finally:
-        tempfile.tempdir = before
 
 
-def _confidences(place: Place) -> None:
-    command("upsample", "--rgb", place.input / "rgb", "--depth", place.input / "depth", "--confidence",
-            place.input / "conf", "--min-confidence", "0.5", "-o", place.out, "--dry-run")  # fmt: skip
+_CONFIDENT = ("record3d", "polycam", "scanner app")
+CAPTURES = {
+    **captures.FOLDERS,
+    "realsense bag": lambda folder: realsense.bag(folder / "scan.bag", realsense.Recording()),
+    "realsense db3": lambda folder: realsense.db3(folder / "scan.db3", realsense.Recording()),
+    **{f"colmap {kind}": functools.partial(colmap, write=f"write_{kind}", depth=True) for kind in ("binary", "text")},
+    "colmap points": functools.partial(colmap, write="write_binary", depth=False),
+    "colmap text points": functools.partial(colmap, write="write_text", depth=False),
+}
+OF_CAPTURES = (
+    Reader("pictures", pictures, upsample(*_PICTURES), 6),
+    Reader("rig", rig, upsample(*_RIG), 6),
+    Reader("poses", captures.tum, upsample("--poses", "{}/groundtruth.txt", "--neighbours", "2")),
+    Reader("zip", zipped, read_zipped),
+    *(Reader(name, make, upsample(*(("--min-confidence", "0.5") if name in _CONFIDENT else ())))
+      for name, make in CAPTURES.items()),
+)  # fmt: skip
 
 
-def _sequence(poses: str, frames: str = ".") -> Callable[[Place], None]:
+# Data sets
+
+
+def data_set(make: Callable[..., Any], **settings: Any) -> Callable[[Place], None]:
+    """Return what reads the first scenes of a data set, at their original size."""
+
     def read(place: Place) -> None:
-        command("upsample", place.input / frames, "--poses", place.input / poses, "--neighbours", "2", "-o", place.out,
-                "--dry-run")  # fmt: skip
-
-    return read
-
-
-def _dataset(module: str, name: str, **arguments: Any) -> Callable[[Place], None]:
-    """Return what reads every scene of a data set, at its original size."""
-
-    def read(place: Place) -> None:
-        import importlib  # noqa: PLC0415 - with what it imports only where it is needed
-
-        from dsr.evaluation.scenes import failure_line  # noqa: PLC0415
-
-        source = getattr(importlib.import_module(f"dsr.data.{module}"), name)(str(place.input), **arguments)
+        source = make(str(place.input), **settings)
         for scene in source.scenes()[:3]:
             try:
                 source.fingerprint(scene)
                 source.load(scene)
-            except _LIBRARY as error:
+            except REFUSALS as error:
                 raise RefusedError([f"{place.input}: {failure_line(scene, error)}"]) from error
 
     return read
 
 
-def _prepared(place: Place) -> None:
-    """Read a data set's scenes twice: prepared, and from the damaged or kept cache."""
-    from dsr.data.icl import ICL  # noqa: PLC0415
-
-    os.environ["DSR_CACHE"] = str(place.input / "cache")
-    source = ICL(str(place.input), "found", size=64)
-    for scene in source.scenes()[:2]:
-        source.load(scene)
+def read_prepared(folder: Path) -> None:
+    """Read a scene of a data set: prepared, and from the damaged or kept cache."""
+    with mock.patch.dict(os.environ, DSR_CACHE=str(folder / "cache")):
+        source = data_set_files.opened(data_set_files.SETS["icl"], folder, size=64)
+        source.load(source.scenes()[0])
 
 
-def _make_prepared(folder: Path) -> None:
-    seeds.icl(folder)
-    before = os.environ.get("DSR_CACHE")
-    _prepared(Place(folder.parent) if folder.name == "input" else _At(folder))
-    if before is not None:
-        os.environ["DSR_CACHE"] = before
+def prepared(folder: Path) -> None:
+    """Write a frame and the cache of its prepared scene."""
+    data_set_files.write_frame("icl", folder)
+    read_prepared(folder)
 
 
-@dataclass(frozen=True)
-class _At(Place):
-    """A place whose input is a given folder."""
-
-    @property
-    def input(self) -> Path:
-        return self.root
-
-
-def _unpack(place: Place) -> None:
-    from dsr.data.download.fetching import unpack  # noqa: PLC0415
-
-    problems = []
-    for name in ("set.zip", "set.tar.gz", "set.tar"):
-        path = place.input / name
-        try:
-            unpack(path, place.out / name, lambda *_, **__: None)
-        except _LIBRARY as error:
-            problems.append(error)
-    if problems:
-        raise problems[0]
+def scenes(folder: Path) -> None:
+    """Write two scenes of dsr's own layout: depth with a mask and a measured map, and disparity."""
+    rows = np.mgrid[0:48, 0:64][0]
+    for name in ("kitchen", "hall"):
+        captures.save(folder / name / "rgb.png", captures.photo())
+    write_depth_file(folder / "kitchen" / "depth.npy", (1.5 + rows / 40).astype(np.float32))
+    write_depth_file(folder / "kitchen" / "depth_lr4.npy", captures.depth().astype(np.float32))
+    write_depth_file(folder / "hall" / "disparity.pfm", (6 + rows / 9).astype(np.float32))
+    captures.save(folder / "kitchen" / "mask.png", np.full((48, 64), 255, np.uint8))
+    for name, more in {"kitchen": {"depth_unit": "m", "hole_value": 0.0}, "hall": {"baseline": 0.08}}.items():
+        (folder / name / "camera.json").write_text(json.dumps({**CAMERA, **more}))
 
 
-def _verify(place: Place) -> None:
-    from dsr.data.download.collections import Collection, Item  # noqa: PLC0415
-    from dsr.data.download.fetching import state, verify  # noqa: PLC0415
-    from dsr.utils.progress import Progress  # noqa: PLC0415
+def tofmark(folder: Path) -> None:
+    """Write scenes of ToFMark as MATLAB 5 and 7.3 files, and one as pictures."""
+    tests = unit("test_format_tofmark")
+    variables = {"intensity": tests.GREY / 255, "depth_gt": tests.TRUTH, "depth_tof": tests.SPARSE}
+    tests.old(folder / "benchmarking_dataset_devil.mat", variables, compress=True)
+    tests.new(folder / "benchmarking_dataset_shark.mat", variables)
+    written(folder / "books.bmp", tests.bmp(tests.GREY))
+    written(folder / "books_depth.bmp", tests.bmp(np.where(tests.SPARSE > 0, tests.GREY, 0)))
 
+
+OF_SETS = (
+    *(Reader(f"data {name}", functools.partial(data_set_files.write_frame, name),
+             data_set(kind.make, **{"scenes": "found", **kind.settings}), 2)
+      for name, kind in data_set_files.SETS.items()),
+    Reader("data folder", scenes, data_set(Folder), 6),
+    Reader("data nyu of one file", lambda folder: unit("test_format_nyu").official(folder / "nyu_depth_v2_labeled.mat"),
+           data_set(NYU, size=None), 1),
+    Reader("data ibims of matrices", lambda folder: unit("test_format_ibims").matrices(folder),
+           data_set(IBims, scenes="found"), 1),
+    Reader("data tofmark", tofmark, data_set(
+        ToFMark, scenes="found", depth_range=[1.0, 4.0], intrinsics=[40.0, 40.0, 19.5, 9.5]), 6),
+    Reader("data prepared", prepared, lambda place: read_prepared(place.input), 1),
+    Reader("doctor", scenes, lambda place: command("doctor", place.input), 1),
+)  # fmt: skip
+
+
+# Single files, weights and archives
+
+
+def archive(path: Path) -> None:
+    """Write an archive as data sets are published in."""
+    if path.suffix == ".zip":
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
+            packed.writestr("set/a.txt", "content " * 40)
+        return
+    with tarfile.open(path, "w:gz" if path.suffix == ".gz" else "w") as tar:
+        member, link = tarfile.TarInfo("set/a.txt"), tarfile.TarInfo("set/link")
+        member.size, link.type, link.linkname = 320, tarfile.SYMTYPE, "a.txt"
+        tar.addfile(member, io.BytesIO(b"content " * 40))
+        tar.addfile(link)
+
+
+def read_archive(path: Path) -> None:
+    unpack(path, path.parents[1] / "out" / "set", lambda *_, **__: None)
+
+
+def checksums(path: Path) -> None:
+    """Write a record of downloaded files, and one of them."""
+    written(path.parent / "books" / "b.txt", b"content")
+    digest = "ed7002b439e9ac845f22357d822bac1444730fbdb6016d3ec9432297b9ec9f73"
+    entries = {"books/b.txt": {"sha256": digest, "size": 7}, "a.zip": {"sha256": None, "size": 9, "files": {"x": 1}}}
+    path.write_text(json.dumps(entries))
+
+
+def read_checksums(path: Path) -> None:
     items = (Item("books/b.txt", ("https://localhost/b.txt",)),)
     collection = Collection("books", "Books", "", "", "", ("books",), None, items)
-    state(collection, place.input)
-    problems = verify(collection, place.input, Progress())
+    state(collection, path.parent)
+    problems = verify(collection, path.parent, Progress())
     if problems:
         raise RefusedError(problems)
 
 
-def _weights(place: Place) -> None:
-    from dsr.methods.networks.trained import TrainedNetwork  # noqa: PLC0415
-
-    TrainedNetwork(place.input / "weights.safetensors", 2, "msg_v")
-
-
-def _published(*names: str) -> Callable[[Place], None]:
-    def read(place: Place) -> None:
-        from dsr.methods.networks.trained import load_msg_weights  # noqa: PLC0415
-
-        _each(place, names, lambda path: load_msg_weights(path, 2))
-
-    return read
+def caffe_model(path: Path) -> None:
+    tests = unit("test_trained_weights")
+    path.write_bytes(tests._caffemodel(tests._caffe_layers(MSGNet(2, "hui"))))
 
 
-def _peers(place: Place) -> None:
-    from dsr.methods.networks.peers.local_filters import SVLRM  # noqa: PLC0415
-    from dsr.methods.networks.peers.peer_network import load_peer  # noqa: PLC0415
-
-    _each(place, ("peer.pth", "peer_old.pth"), lambda path: load_peer(path, SVLRM, 4))
+def peer(path: Path) -> None:
+    """Write a network's tensors by name, in torch's present or earlier format."""
+    torch.save(SVLRM(4).state_dict(), path, _use_new_zipfile_serialization="old" not in path.name)
 
 
-def _lpips(place: Place) -> None:
-    from dsr.metrics.lpips import load_lpips  # noqa: PLC0415
-
-    _each(place, ("peer.pth", "peer_old.pth"), load_lpips)
-
-
-def _each(place: Place, names: tuple[str, ...], read: Callable[[Path], Any]) -> None:
-    """Read several files, and raise the first refusal at the end."""
-    problems = []
-    for name in names:
-        try:
-            read(place.input / name)
-        except _LIBRARY as error:
-            problems.append(error)
-    if problems:
-        raise problems[0]
-
-
-def _report(*parts: str) -> Callable[[Place], None]:
-    def read(place: Place) -> None:
-        command("report", place.input, "-o", place.out / "report", "--only", ",".join(parts))
-
-    return read
+_OPEN3D = {"width": 64, "height": 48, "intrinsic_matrix": [50, 0, 0, 0, 51, 0, 31, 24, 1]}
+FILES = {
+    **single_files.READERS,
+    "open3d.json": (single_files.text(json.dumps(_OPEN3D)), read_any_camera),
+    "trajectory.log": (single_files.text("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"), read_poses),
+    "times.txt": (single_files.text("# time tx ty tz qx qy qz qw\n1305031102.03 0.1 0.2 -0.3 0 0 0 1\n"), read_poses),
+    "foreground.png": (single_files.picture, lambda path: read_foreground(path, (48, 64))),
+    "published.pth": (lambda path: unit("test_trained_weights")._published(path),
+                      lambda path: load_msg_weights(path, 4)),
+    "hui.caffemodel": (caffe_model, lambda path: load_msg_weights(path, 2)),
+    **{name: (peer, lambda path: load_peer(path, SVLRM, 4)) for name in ("peer.pth", "peer_old.pth")},
+    "lpips.pth": (lambda path: torch.save(random_trunk(), path), load_lpips),
+    "checksums.json": (checksums, read_checksums),
+    **dict.fromkeys(("set.zip", "set.tar", "set.tar.gz"), (archive, read_archive)),
+}  # fmt: skip
 
 
-def _report_with_study(place: Place) -> None:
-    command("report", place.input, "-o", place.out / "report", "--only", "tables", "--study", place.input / "study.csv")
+def _single(name: str, write: Callable[[Path], Any], read: Callable[[Path], Any]) -> Reader:
+    return Reader(name, lambda folder: write(folder / name), lambda place: read(place.input / name))
 
 
-def _collect(place: Place) -> None:
-    command("study", "collect", place.input, place.input / "answers", "-o", place.out / "study.csv")
-
-
-def _hydra(name: str, *arguments: str) -> None:
-    """Run ``eval.py`` or ``train.py`` in this process, without ``dsr``, which catches more."""
-    from dsr.app.entry import run_eval, run_train  # noqa: PLC0415
-
-    try:
-        _run(lambda: {"eval": run_eval, "train": run_train}[name](arguments))
-    except RefusedError as refused:  # a line may begin with the key of a configuration
-        raise RefusedError([re.sub(r"^([a-z_]+(\.\w+)*: )", r"input/ \1", line) for line in refused.lines]) from refused
-
-
-def _eval_again(place: Place) -> None:
-    _hydra("eval", *run_seeds.evaluation_arguments(place.input, place.input / "run"))
-
-
-def _eval_run(place: Place) -> None:
-    _hydra("eval", f"run={place.input / 'run'}", f"output_dir={place.out / 'run'}", "metrics.lpips=false", "device=cpu")
-
-
-def _resume(place: Place) -> None:
-    _hydra("train", f"resume={place.input / 'run'}", "device=cpu")
-
-
-def _checkpoint(place: Place) -> None:
-    from dsr.training.module import SuperResolution  # noqa: PLC0415
-
-    path = place.input / "run" / "checkpoints" / "best.ckpt"
-    SuperResolution.load_from_checkpoint(path)
-
-
-def _foreground(place: Place) -> None:
-    from dsr.methods.classical.shape_from_shading import read_foreground  # noqa: PLC0415
-
-    read_foreground(place.input / "mask.png", (48, 64))
-
-
-def _configured(place: Place) -> None:
-    command("upsample", "--rgb", place.input / "photo.png", "--depth", place.input / "depth.png", "--config-dir",
-            place.input / "conf", "--method", "more", "--set", "data_weight=30", "-o", place.out,
-            "--dry-run")  # fmt: skip
-
-
-def _composed(place: Place) -> None:
-    """Compose an evaluation with a user's method and data set, and read the method."""
-    from omegaconf import DictConfig  # noqa: PLC0415
-
-    from dsr.app.entry import run_command  # noqa: PLC0415
-    from dsr.app.schema import EvalConfig, plain_config  # noqa: PLC0415
-
-    def job(config: DictConfig) -> None:
-        EvalConfig.of(plain_config(config))
-
-    folder = place.input / "conf"
-    _run(lambda: run_command("eval", job, ["--config-dir", str(folder), "method=mine", "dataset=ours"]))
-
-
-READERS = (
-    *(Reader(f"depth {kind}", lambda folder, kind=kind: seeds.pair(folder, f".{kind}"), _pair(f"depth.{kind}"))
-      for kind in ("png", "tiff", "npy", "npz", "pfm", "exr")),
-    Reader("depth icl", seeds.icl_depth, _pair("photo.depth"), 2),
-    Reader("jpeg with exif", seeds.jpeg_with_exif, _pair("depth.png", rgb="photo.jpg")),
-    Reader("photos", seeds.photos, _recording()),
-    Reader("rig", seeds.rig, _pair("depth.png", "--camera", "camera.json", "--depth-camera", "ir.json", "--extrinsics",
-                                   "extrinsics.txt")),
-    Reader("open3d camera", seeds.open3d_camera, _pair("depth.npy", "--camera", "camera.json", "--depth-camera",
-                                                       "camera.json", "--extrinsics", "extrinsics.json")),
-    Reader("matrix, mask", seeds.matrix_camera, _pair("depth.tiff", "--camera", "matrix.txt", "--mask", "mask.png",
-                                                      "--confidence", "confidence.png", "--min-confidence", "0.5")),
-    Reader("confidence", seeds.confidence_folder, _confidences),
-    Reader("tum", seeds.tum, _recording()),
-    Reader("tum poses", seeds.tum, _sequence("groundtruth.txt")),
-    Reader("kitti poses", seeds.poses_of_lines, _sequence("kitti.txt", "frames")),
-    Reader("log poses", seeds.poses_of_lines, _sequence("trajectory.log", "frames")),
-    Reader("colmap", seeds.colmap, _sequence("sparse/0/images.bin")),
-    Reader("colmap text", lambda folder: seeds.colmap(folder, binary=False), _recording()),
-    Reader("colmap points", lambda folder: seeds.colmap(folder, depth=False), _recording()),
-    Reader("colmap text points", lambda folder: seeds.colmap(folder, binary=False, depth=False), _recording()),
-    Reader("dsr scenes", seeds.dsr_scenes, _recording()),
-    Reader("stray", lambda folder: captures.stray(folder, video=False), _recording()),
-    Reader("stray video", captures.stray, _recording()),
-    Reader("record3d", seeds.r3d, _recording("--min-confidence", "0.5")),
-    Reader("record3d folder", seeds.record3d_folder, _recording()),
-    Reader("record3d export", seeds.record3d_export, _recording()),
-    Reader("polycam", captures.polycam, _recording("--min-confidence", "0.5")),
-    Reader("arkitscenes app", captures.arkitscenes, _recording()),
-    Reader("open3d", captures.open3d, _recording()),
-    Reader("sens", seeds.sens, _recording()),
-    Reader("scannetpp", captures.scannetpp, _recording(), 2),
-    Reader("scannetpp deflate", lambda folder: captures.scannetpp(folder, "deflate"), _recording(), 1),
-    Reader("scannet", captures.scannet, _recording(), 2),
-    Reader("7-scenes", captures.seven_scenes, _recording(), 2),
-    Reader("sunrgbd app", captures.sunrgbd, _recording(), 2),
-    Reader("replica", captures.replica, _recording(), 2),
-    Reader("scanner app", captures.scanner_app, _recording("--min-confidence", "0.5"), 2),
-    Reader("zip", seeds.zipped, _zip),
-    Reader("ros 1", lambda folder: captures.ros(folder / "scan.bag", 1), _recording(), 2),
-    Reader("ros 1 jpeg", lambda folder: captures.ros(folder / "scan.bag", 1, floats=True, compressed=True),
-           _recording(), 2),
-    Reader("ros 2", seeds.ros2, _recording(), 2),
-    Reader("ros 2 packed", seeds.ros2_packed, _recording(), 1),
-    Reader("kinect", seeds.kinect, _recording(), 2),
-    Reader("heic", seeds.heic, _recording()),
-    Reader("heic beside depth", seeds.heic_beside_depth, _pair("depth.npy", rgb="photo.heic"), 2),
-    Reader("zed", captures.zed, _recording(), 1),
-    Reader("ros 2 mcap", seeds.ros2_alone, _recording(), 2),
-    Reader("ros rvl", lambda folder: captures.ros(folder / "scan.bag", 1, rvl_depth=True), _recording(), 2),
-    Reader("realsense bag", lambda folder: realsense.bag(folder / "scan.bag", realsense.Recording()), _recording(), 2),
-    Reader("realsense db3", lambda folder: realsense.db3(folder / "scan.db3", realsense.Recording()), _recording(), 2),
-    Reader("data folder", seeds.dsr_scenes, _dataset("folder", "Folder")),
-    Reader("doctor", seeds.dsr_scenes, lambda place: command("doctor", place.input), 1),
-    Reader("middlebury", seeds.middlebury, _dataset("middlebury", "Middlebury", scenes="found", size=None, fill=())),
-    Reader("middlebury 2006", seeds.middlebury_levels,
-           _dataset("middlebury", "MiddleburyLevels", year=2006, scenes="found", size=None)),
-    Reader("icl", seeds.icl, _dataset("icl", "ICL", scenes="found", size=None), 1),
-    Reader("prepared", _make_prepared, _prepared, 1),
-    Reader("sunrgbd", seeds.sunrgbd, _dataset("sunrgbd", "SunRGBD", scenes="found", size=None)),
-    Reader("tofmark 5", seeds.tofmark_old,
-           _dataset("tofmark", "ToFMark", scenes="found", depth_range=[1.0, 4.0], intrinsics=[40.0, 40.0, 19.5, 9.5])),
-    Reader("tofmark 7.3", seeds.tofmark_new,
-           _dataset("tofmark", "ToFMark", scenes="found", intrinsics=[40.0, 40.0, 19.5, 9.5])),
-    Reader("nyu", seeds.nyu, _dataset("nyu", "NYU", size=None), 2),
-    Reader("nyu files", seeds.nyu_files, _dataset("nyu", "NYU", split="test", scenes="found"), 2),
-    Reader("tartanair", seeds.tartanair, _dataset("tartanair", "TartanAir", size=None), 2),
-    Reader("sintel", seeds.sintel, _dataset("sintel", "Sintel", scenes="found")),
-    Reader("rgbdd", lambda folder: seeds.unit("test_data_sets").write_frame("rgbdd", folder),
-           _dataset("rgbdd", "RGBDD", real=True, scenes="found"), 2),
-    Reader("ddrnet", lambda folder: seeds.unit("test_data_sets").write_frame("ddrnet", folder),
-           _dataset("ddrnet_frames", "DDRNetFrames"), 1),
-    Reader("lu", lambda folder: seeds.unit("test_format_eight_bit").pair(folder),
-           _dataset("eight_bit", "EightBit", benchmark="lu", scenes="found")),
-    Reader("arkitscenes", lambda folder: seeds.unit("test_format_arkitscenes").frame(folder),
-           _dataset("arkitscenes", "ARKitScenes"), 1),
-    Reader("cleargrasp", lambda folder: seeds.unit("test_format_cleargrasp").capture(folder),
-           _dataset("cleargrasp", "ClearGrasp", synthetic=False)),
-    Reader("cleargrasp synthetic", lambda folder: seeds.unit("test_format_cleargrasp").rendering(folder),
-           _dataset("cleargrasp", "ClearGrasp", synthetic=True)),
-    Reader("ibims", lambda folder: seeds.unit("test_format_ibims").matrices(folder),
-           _dataset("ibims", "IBims", scenes="found"), 1),
-    Reader("ibims pictures", lambda folder: seeds.unit("test_format_ibims").pictures(folder),
-           _dataset("ibims", "IBims", scenes="found"), 1),
-    Reader("hammer", lambda folder: seeds.unit("test_data_sets").write_frame("hammer", folder),
-           _dataset("hammer", "Hammer", sensor="tof")),
-    Reader("archives", seeds.archives, _unpack),
-    Reader("checksums", seeds.checksums, _verify),
-    Reader("weights", seeds.dsr_weights, _weights, 2),
-    Reader("msg torch", seeds.torch_weights, _published("voynov.pth", "earlier.pth"), 2),
-    Reader("msg caffe", seeds.caffe_weights, _published("hui.caffemodel")),
-    Reader("peers", seeds.peer_weights, _peers, 2),
-    Reader("lpips", seeds.peer_weights, _lpips, 2),
-    Reader("report", run_seeds.runs, _report("tables", "metrics"), 1),
-    Reader("report page", run_seeds.runs, _report("figures", "page"), 1),
-    Reader("report study", run_seeds.study_table, _report_with_study, 2),
-    Reader("study build", run_seeds.runs,
-           lambda place: command("study", "build", place.input, "-o", place.out / "study", "--light", "e1"), 2),
-    Reader("study collect", run_seeds.study, _collect),
-    Reader("eval again", run_seeds.evaluation, _eval_again, 1),
-    Reader("eval run", run_seeds.training, _eval_run, 1),
-    Reader("train resume", run_seeds.interrupted_training, _resume, 1),
-    Reader("train weights", run_seeds.training_without_weights, _resume, 1),
-    Reader("checkpoint", run_seeds.training, _checkpoint, 2),
-    Reader("foreground", seeds.foreground, _foreground),
-    Reader("view", run_seeds.results,
-           lambda place: command("view", place.input / "out", "--no-open", "-o", place.out / "view.html")),
-    Reader("fuse", run_seeds.results,
-           lambda place: command("fuse", place.input / "out", "-o", place.out / "mesh.ply", "--voxel", "0.05"), 2),
-    Reader("upsample again", run_seeds.kept_results,
-           lambda place: command("upsample", *run_seeds.upsample_again(place.input)), 2),
-    Reader("upsample more", run_seeds.kept_results,
-           lambda place: command("upsample", *run_seeds.more_of_results(place.input)), 1),
-    Reader("configuration", run_seeds.user_configuration, _configured, 2),
-    Reader("configurations", run_seeds.user_configuration, _composed, 1),
-)  # fmt: skip
-_ROUND = tuple(reader for turn in range(4) for reader in READERS if reader.weight > turn)
-"""The readers of consecutive cases."""
-
-
-def reader_of(number: int) -> Reader:
-    """Return the reader of a case."""
-    return _ROUND[number % len(_ROUND)]
-
-
-def numbers_of(reader: Reader, count: int) -> list[int]:
-    """Return the numbers of the first cases of a reader."""
-    rounds = range(count)
-    numbers = [turn * len(_ROUND) + place for turn in rounds for place, each in enumerate(_ROUND) if each is reader]
-    return numbers[:count]
+OF_FILES = tuple(_single(name, *functions) for name, functions in FILES.items())

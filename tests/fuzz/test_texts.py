@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from dsr.app.entry import run_command
 from dsr.cli import main
-from fuzz.values import NUMBERS
+from fuzz.texts import NUMBERS
 
 checked = settings(
     derandomize=True, database=None, deadline=None, max_examples=100, suppress_health_check=list(HealthCheck)

@@ -1,74 +1,126 @@
-"""Mutations of text, JSON, YAML and tables."""
+"""Mutations of text, JSON and YAML: values of wrong types, out of range, huge, deep or malicious in place of others."""
 
 import json
+import os
+import pickle
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from random import Random
 from typing import Any
 
 import yaml
 
-from fuzz import values
+from fuzz.guard import MARK
 
+_DEEP = 10_000  # Levels of nested lists
 _LONGEST = 16 << 20  # Characters of a line that is made longer, and of all lines that are added
-_HOLE = "\ue000hole\ue000"
-_NUMBER = re.compile(r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
+_PLAIN: tuple[Any, ...] = (
+    None, True, False, "", -1, 0, 1, 2, 0.5, -0.0, 1e-320, 1e19, 1e308, -1e308, 2**31, 2**63, -(2**63), 2**64, 10**30,
+    [], {}, [[]], {"": {}}, [1, 2, 3], [1e6] * 100, {"a": 1}, "nan", "None", "0", "1/0", "abc", " ", "\n", "\0",
+    "\x1b[31m", "é\u202e\ufeff", "../../etc/passwd", "/etc/passwd", "/dev/zero", "~", "a/b", ".", "..", "C:\\x",
+    "a" * 300, "${oc.env:HOME}", "${now:%Y}", "%s%n{0}", "=1+1", "<script>alert(1)</script>",
+    "\\input{/etc/passwd}", "x" * 10_000,
+)  # fmt: skip
+_RAW = (
+    "1e400", "-1e400", "NaN", "Infinity", "-Infinity", "9" * 400, "-" + "9" * 400, "0." + "9" * 400, "1e-400",
+    "1e999999", "9" * 5000, "[" * _DEEP + "]" * _DEEP, '{"a":' * _DEEP + "1" + "}" * _DEEP, "0x10", "01", "+1", "1_000",
+    "'", "\\u0000", '"\\ud800"', "tru", "",
+)  # fmt: skip
+"""Texts in place of a value in JSON or another text."""
+NUMBERS = (
+    "nan", "inf", "-inf", "1e400", "-1e400", "1e308", "1e-320", "0", "-0", "-1", "1", "9" * 400, "9" * 5000, "abc", "",
+    "1e19", "4294967296", "18446744073709551616", "0x1p3", "1_0", "1,5", "٣", "--1", "1e", "3.", ".", "x" * 10_000,
+    "2147483647", "1e7",
+)  # fmt: skip
+_WORDS = (
+    *NUMBERS, *_RAW, "../" * 9 + "etc/passwd", "../../etc/passwd", "..\\..\\etc\\passwd", "C:\\etc\\passwd", MARK, "\0",
+    "\x1b[2J", "%00", "a" * 300,
+)  # fmt: skip
+_TARGETS = (
+    "os.system", "os.mkdir", "subprocess.run", "builtins.exec", "builtins.eval", "shutil.rmtree", "pathlib.Path",
+    f"{MARK}.run", f"{MARK}", "dsr.cli.main", "dsr.methods", "dsr.nowhere.X", "..", "a b.c", ".x", "x.", "json.loads",
+    "dsr.utils.files.write_text", "dsr.utils.configuration.load_object", "torch.load",
+)  # fmt: skip
+_KEYS = ("", "x", "_target_", "__class__", "__init__", "defaults", "root", "a" * 300, "\x1b[2J", "\u202e")
 _YAML = (
-    "!!python/object/apply:os.mkdir ['{canary}']", "!!python/object/apply:os.system ['mkdir {canary}']",
+    f"!!python/object/apply:os.mkdir ['{MARK}']", f"!!python/object/apply:os.system ['mkdir {MARK}']",
     "!!python/name:os.system", "!!python/module:os", "!!binary aGVsbG8=", "&a [*a]", "*nowhere", "!!float x", "!<x> 1",
-    "${{oc.env:HOME}}", "${{oc.decode:'[1,2]'}}", "${{x.y}}", "${{", "{{? }}", "1:20", "2001-01-01", "0o17",
-    "~", "<<: 1", "!!set {{a, b}}", "!!omap [a: 1]", "|\n  text", "???",
+    "${oc.env:HOME}", "${oc.decode:'[1,2]'}", "${x.y}", "${", "{? }", "1:20", "2001-01-01", "0o17", "~", "<<: 1",
+    "!!set {a, b}", "!!omap [a: 1]", "|\n  text", "???",
 )  # fmt: skip
 _BOMB = "a: &a [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
     f"{b}: &{b} [{','.join(['*' + a] * 10)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
 )
+_HOLE = "dsr-hole"
 
 
-def mutate_text(random: Random, text: str, canary: Path) -> bytes:
+class _Payload:
+    """An object whose pickle makes a folder when it is read."""
+
+    def __init__(self, what: int, canary: Path) -> None:
+        self._what, self._canary = what, str(canary)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        code = f"import os\nos.makedirs({self._canary!r}, exist_ok=True)\n{MARK} = 1"
+        return (
+            (os.mkdir, (self._canary,)),
+            (os.system, (f"mkdir -p '{self._canary}'",)),
+            (exec, (code,)),
+            (eval, (f"__import__('os').makedirs({self._canary!r})",)),
+        )[self._what]
+
+
+def pickled(random: Random, canary: Path) -> bytes:
+    """Return a pickle that makes the canary, perhaps hidden among plain values."""
+    payload: Any = _Payload(random.randrange(4), canary)
+    content = random.choice((payload, {"model_state_dict": payload, "state_dict": {"a": payload}}))
+    return pickle.dumps(content, protocol=random.choice((0, 2, 4, 5)))
+
+
+def mutate_text(random: Random, text: str) -> bytes:
     """Return a text with something changed."""
-    return random.choice(_TEXT)(random, text, canary)
+    return random.choice(_TEXT)(random, text)
 
 
-def mutate_json(random: Random, text: str, canary: Path) -> bytes:
-    """Return JSON with something changed: a value, a key, or the text."""
+def mutate_structured(random: Random, text: str, *, of_yaml: bool) -> bytes:
+    """Return JSON or YAML with something changed: a value, a key, a tag, or the text."""
     try:
-        content = json.loads(text)
-    except (ValueError, RecursionError):
-        return mutate_text(random, text, canary)
-    if random.random() < 0.2:
-        return mutate_text(random, text, canary)
-    if random.random() < 0.3:
-        changed = json.dumps(_replaced(random, content, _HOLE))
-        return changed.replace(json.dumps(_HOLE), random.choice(values.RAW), 1).encode()
-    return json.dumps(_changed(random, content, canary)).encode()
-
-
-def mutate_yaml(random: Random, text: str, canary: Path) -> bytes:
-    """Return YAML with something changed: a value, a key, a tag, or the text."""
-    try:
-        content = yaml.safe_load(text)
+        content = yaml.safe_load(text) if of_yaml else json.loads(text)
     except (yaml.YAMLError, ValueError, RecursionError):
-        return mutate_text(random, text, canary)
+        return mutate_text(random, text)
     pick = random.random()
-    if pick < 0.15:
-        return mutate_text(random, text, canary)
     if pick < 0.2:
+        return mutate_text(random, text)
+    if of_yaml and pick < 0.25:
         return (text + "\n" + _BOMB).encode()
     if pick < 0.45:
-        changed = yaml.safe_dump(_replaced(random, content, _HOLE), sort_keys=False, allow_unicode=True)
-        value = (
-            random.choice((*_YAML, *values.RAW)).replace("{canary}", str(canary)).replace("{{", "{").replace("}}", "}")
-        )
-        return changed.replace(_HOLE, value, 1).encode(errors="surrogatepass")
-    return yaml.safe_dump(_changed(random, content, canary), sort_keys=False).encode(errors="surrogatepass")
+        changed = _dumped(_replaced(random, content, _HOLE), of_yaml=of_yaml)
+        value = random.choice((*_YAML, *_RAW) if of_yaml else _RAW)
+        changed = changed.replace(_HOLE if of_yaml else json.dumps(_HOLE), value, 1)
+    else:
+        for _ in range(random.choice((1, 1, 1, 2))):
+            content = _changed(random, content)
+        changed = _dumped(content, of_yaml=of_yaml)
+    return changed.encode(errors="surrogatepass")
+
+
+def _dumped(content: Any, *, of_yaml: bool) -> str:
+    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True) if of_yaml else json.dumps(content)
+
+
+def _plain(random: Random) -> Any:
+    """Return a value that JSON and YAML can hold."""
+    pick = random.random()
+    if pick < 0.1:
+        return random.choice((*_TARGETS, MARK))
+    if pick < 0.15:
+        return {"_target_": random.choice(_TARGETS), "name": "x", "command": f"mkdir {MARK}", "path": MARK}
+    return random.choice(_PLAIN)
 
 
 def _places(content: Any) -> list[tuple[Any, Any]]:
-    """Return the containers in a content with each of their keys; long lists count with a few.
-
-    A container that stands in several places, as by the aliases of a bomb from an earlier change, is counted once.
-    """
+    """Return the containers in a content with each of their keys; long lists count with a few, aliases once."""
     found: list[tuple[Any, Any]] = []
     seen: set[int] = set()
     containers = [(content, 0)]
@@ -94,88 +146,71 @@ def _replaced(random: Random, content: Any, value: Any) -> Any:
     return content
 
 
-def _changed(random: Random, content: Any, canary: Path) -> Any:
-    """Return a content with one or two things changed."""
-    for _ in range(random.choice((1, 1, 1, 2))):
-        places = _places(content)
-        pick = random.random()
-        if pick < 0.6 or not places:
-            content = _replaced(random, content, values.plain(random, canary))
-            continue
-        container, key = random.choice(places)
-        if pick < 0.72:
-            del container[key]
-        elif pick < 0.8 and isinstance(container, dict):
-            container[random.choice(("", "x", "_target_", "__class__", "a" * 300, str(key) + " ", "\x1b[2J"))] = (
-                container.pop(key)
-            )
-        elif pick < 0.9 and isinstance(container, dict):
-            container[random.choice(("_target_", "extra", "__init__", "defaults", "root", "\u202e"))] = values.plain(
-                random, canary
-            )
-        else:
-            other, name = random.choice(places)
-            if not isinstance(other[name], dict | list):
-                container[key] = other[name]
+def _changed(random: Random, content: Any) -> Any:
+    """Return a content with a value replaced, removed or copied, or a key renamed or added."""
+    places = _places(content)
+    pick = random.random()
+    if pick < 0.6 or not places:
+        return _replaced(random, content, _plain(random))
+    container, key = random.choice(places)
+    other, name = random.choice(places)
+    if pick < 0.72:
+        del container[key]
+    elif pick < 0.8 and isinstance(container, dict):
+        container[random.choice((*_KEYS, f"{key} "))] = container.pop(key)
+    elif pick < 0.9 and isinstance(container, dict):
+        container[random.choice(_KEYS)] = _plain(random)
+    elif not isinstance(other[name], dict | list):
+        container[key] = other[name]
     return content
 
 
-def _number(random: Random, text: str, _: Path) -> bytes:
-    found = list(_NUMBER.finditer(text))
-    if not found:
-        return b"1e400"
-    each = random.choice(found)
-    return (text[: each.start()] + random.choice(values.NUMBERS) + text[each.end() :]).encode(errors="replace")
+def _replace(pattern: str, values: Sequence[str]) -> Callable[[Random, str], bytes]:
+    """Return a mutation that puts a value in the place of one match of a pattern."""
+
+    def change(random: Random, text: str) -> bytes:
+        found = list(re.finditer(pattern, text))
+        value = random.choice(values)
+        if found:
+            each = random.choice(found)
+            value = text[: each.start()] + value + text[each.end() :]
+        return value.encode(errors="replace")
+
+    return change
 
 
-def _word(random: Random, text: str, canary: Path) -> bytes:
-    found = list(re.finditer(r"[^\s,;:\"'{}\[\]]+", text))
-    if not found:
-        return b"x"
-    each = random.choice(found)
-    value = random.choice(
-        (*values.NUMBERS, *values.RAW, *values.OUTSIDE, str(canary), "\0", "\x1b[2J", "%00", "a" * 300)
-    )
-    return (text[: each.start()] + value + text[each.end() :]).encode(errors="replace")
-
-
-def _lines(random: Random, text: str, _: Path) -> bytes:
+def _lines(random: Random, text: str) -> bytes:
     lines = text.splitlines() or [""]
     at = random.randrange(len(lines))
-    kind = random.randrange(7)
-    if kind == 0:
-        del lines[at]
-    elif kind == 1:
-        lines.insert(at, lines[random.randrange(len(lines))])
-    elif kind == 2:
-        lines[at : at + 2] = [" ".join(lines[at : at + 2])]
-    elif kind == 3:
-        lines[at] = lines[at][: random.randrange(len(lines[at]) + 1)]
-    elif kind == 4:
+    fits = max(2, _LONGEST // (len(lines[at]) + 1))  # repetitions within what a worker can hold
+    changes = (
+        [],
+        [lines[at], random.choice(lines)],
+        [" ".join(lines[at : at + 2])],
+        [lines[at][: random.randrange(len(lines[at]) + 1)]],
+        [lines[at] * min(2000, fits)],
+        [lines[at]] * min(3000, fits),
+    )
+    lines[at : at + 1] = random.choice(changes)
+    if random.random() < 0.15:
         lines = lines[:at]
-    else:  # a long line, or many lines, within what a worker can hold
-        fits = max(2, _LONGEST // (len(lines[at]) + 1))
-        if kind == 5:
-            lines[at] = lines[at] * min(2000, fits)
-        else:
-            lines[at:at] = [lines[at]] * min(3000, fits)
     return "\n".join(lines).encode(errors="replace")
 
 
-def _coding(random: Random, text: str, _: Path) -> bytes:
+def _coding(random: Random, text: str) -> bytes:
+    content = text.encode()
     return random.choice((
-        lambda: text.encode("utf-16"), lambda: b"\xef\xbb\xbf" + text.encode(),
-        lambda: text.replace("\n", "\r").encode(), lambda: b"\x80" + text.encode(),
-        lambda: text.replace("\n", "\r\n").encode(), lambda: text.encode() + b"\xff\xfe\x80",
-        lambda: text.encode().replace(b" ", b"\0"), lambda: text.replace(" ", "\u00a0").encode(),
-        lambda: text.replace(",", ";").encode(), lambda: text.upper().encode(), lambda: text.encode("utf-32"),
-        lambda: text.replace('"', "'").encode(), lambda: b'"' + text.encode(), lambda: text.replace("\n", "").encode(),
-    ))()  # fmt: skip
+        text.encode("utf-16"), text.encode("utf-32"), b"\xef\xbb\xbf" + content, b"\x80" + content,
+        content + b"\xff\xfe\x80", content.replace(b"\n", b"\r"), content.replace(b"\n", b"\r\n"),
+        content.replace(b"\n", b""), content.replace(b" ", b"\0"), text.replace(" ", "\u00a0").encode(),
+        content.replace(b",", b";"), content.upper(), content.replace(b'"', b"'"), b'"' + content,
+    ))  # fmt: skip
 
 
-def _cut(random: Random, text: str, _: Path) -> bytes:
+def _cut(random: Random, text: str) -> bytes:
     return text.encode()[: random.randrange(len(text) + 1)]
 
 
-_Mutation = Callable[[Random, str, Path], bytes]
-_TEXT: tuple[_Mutation, ...] = (_number, _number, _number, _word, _word, _lines, _lines, _coding, _cut)
+_NUMBER = _replace(r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?", NUMBERS)
+_WORD = _replace(r"[^\s,;:\"'{}\[\]]+", _WORDS)
+_TEXT = (_NUMBER, _NUMBER, _NUMBER, _WORD, _WORD, _lines, _lines, _coding, _cut)

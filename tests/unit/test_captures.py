@@ -54,12 +54,6 @@ def folder(tmp_path):
     return path
 
 
-def unpacked(folder):
-    with zipfile.ZipFile(captures.record3d(folder.parent / "packed.r3d")) as archive:
-        archive.extractall(folder)
-    return folder
-
-
 def three_dmatch(folder):
     captures.seven_scenes(folder)
     captures.write_matrix(folder / "camera-intrinsics.txt", captures.intrinsic_matrix())
@@ -85,7 +79,7 @@ CASES = {
     "stray video": STRAY,
     "stray files": replace(STRAY, write=lambda folder: captures.stray(folder, video=False)),
     "record3d": RECORD3D,
-    "record3d unpacked": replace(RECORD3D, write=unpacked),
+    "record3d unpacked": replace(RECORD3D, write=captures.record3d_unpacked),
     "record3d export": replace(RECORD3D, write=captures.record3d_export, confident=False),
     "polycam": Case(captures.polycam, own=True, up="y", confident=True),
     "arkitscenes": Case(captures.arkitscenes, own=True, up="z", time=(10, 0.1), confident=True),
@@ -165,7 +159,7 @@ def test_a_file_that_is_cut_off_is_one_line_that_names_it(folder, name):
 
 
 WRITERS = {
-    "Stray Scanner": captures.stray, "Record3D": unpacked, "Polycam": captures.polycam,
+    "Stray Scanner": captures.stray, "Record3D": captures.record3d_unpacked, "Polycam": captures.polycam,
     "ARKitScenes": captures.arkitscenes, "3D Scanner App": captures.scanner_app, "ScanNet": captures.scannet,
     "ScanNet++ iPhone": lambda folder: captures.scannetpp(folder, "files") or folder / "iphone",
     "7-Scenes or 3DMatch": captures.seven_scenes, "SUN RGB-D": lambda folder: captures.sunrgbd(folder) or folder,

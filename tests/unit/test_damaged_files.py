@@ -18,13 +18,15 @@ import bombs
 import captures
 import cv2
 import h5py
+import lightning
 import numpy as np
 import pytest
 import safetensors.torch
 import torch
 from omegaconf import OmegaConf
-from scipy.io import savemat
+from single_files import KEY, READERS, read_capture, read_picture_file
 from small_results import write_result
+from torch.utils.data import DataLoader
 
 from dsr.app.entry import run_command
 from dsr.app.training_runs import read_config, read_plain_yaml
@@ -36,40 +38,35 @@ from dsr.data.matlab import read_variables
 from dsr.evaluation.results import load_errors, load_prediction, prediction_path, sample_path
 from dsr.evaluation.run_files import load_results, read_run
 from dsr.geometry.camera import Camera
-from dsr.io.cameras import read_any_camera, read_camera
 from dsr.io.captures.arkit import ARKITSCENES, POLYCAM
 from dsr.io.captures.record3d import RECORD3D
 from dsr.io.captures.stray import STRAY
-from dsr.io.depth_files import DEPTH_SUFFIXES, read_depth_file, write_depth_file
+from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import read_input, write_input
-from dsr.io.images import read_mask
 from dsr.io.inputs import read_picture
 from dsr.io.pairs import Pair
-from dsr.io.photos import read_photo
 from dsr.io.reading import Reading
-from dsr.io.trajectories import read_poses, read_transform
-from dsr.methods.networks.msg_net import MSGNet
+from dsr.io.trajectories import read_transform
 from dsr.methods.networks.peers.peer_network import read_tensors
 from dsr.methods.networks.trained import NETWORKS, load_msg_weights
-from dsr.methods.networks.weight_files import is_dsr_weights, load_network, save_network
+from dsr.methods.networks.weight_files import is_dsr_weights, load_network
+from dsr.methods.recipe import read_recipe
 from dsr.methods.weights import packaged_weights
 from dsr.report.study.answers import files_of, read_all
-from dsr.report.study.key import Candidate, Key, Trial, read_key, write_key
+from dsr.report.study.key import read_key, write_key
 from dsr.report.study.study_table import read_study
 from dsr.report.surface_page import is_view
 from dsr.sample import DepthSample
 from dsr.utils.arrays import read_arrays
 from dsr.utils.configuration import ConfigError
-from dsr.utils.console import one_line, print_error
+from dsr.utils.console import one_line, print_error, printable
 from dsr.utils.guards import TooLargeError, is_number, parse_json, read_limited, read_member
-from dsr.utils.torch_files import read_torch_file
+from dsr.utils.lightning import fit, make_trainer
 
 HUGE = "1" + "0" * 400
 NO_NUMBERS = ("true", "Infinity", HUGE, '"4"', "[]")  # as JSON; a float holds none of them
 DEEP = "[" * 100_000
 MOST = 450 << 20  # growth of memory in bytes while a file is refused; MATLAB's old files take the most
-CANDIDATES = {name: Candidate(name, name, "runs") for name in ("a", "b")}
-KEY = Key("0123", "e4", 1, 0, {"s1": Trial("simgeo", "cube", 4, "box", CANDIDATES)})
 
 
 def refusal(path, read, *arguments):
@@ -101,14 +98,6 @@ def limited():
     resource.setrlimit(resource.RLIMIT_DATA, before)
 
 
-def photo(path):
-    return read_photo(path, (8, 8))
-
-
-def capture(path):
-    return [pair.capture.photo.read() for pair in RECORD3D.frames(path).pairs]
-
-
 BOMBS = [
     (bombs.npz, "x.npz", read_depth_file),
     (bombs.npz, "x.npz", load_prediction),
@@ -116,12 +105,12 @@ BOMBS = [
     (bombs.npz, "x.npz", read_input),
     (bombs.npy_sparse, "x.npy", read_depth_file),
     (bombs.png, "x.png", read_depth_file),
-    (bombs.jpeg, "x.jpg", photo),
+    (bombs.jpeg, "x.jpg", read_picture_file),
     (bombs.tiff, "x.tiff", read_depth_file),
     (bombs.exr, "x.exr", read_depth_file),
     (bombs.mat5, "x.mat", read_variables),
     (bombs.mat73, "x.mat", read_variables),
-    (bombs.r3d, "x.r3d", capture),
+    (bombs.r3d, "x.r3d", read_capture),
 ]
 
 
@@ -199,7 +188,7 @@ def test_heic_file_of_gigabytes_is_not_read_for_its_exif_data(tmp_path):
     with (tmp_path / "photo.heic").open("wb") as file:
         file.truncate(3 << 30)
     tracemalloc.start()
-    assert refusal(tmp_path / "photo.heic", photo, tmp_path / "photo.heic")
+    assert refusal(tmp_path / "photo.heic", read_picture_file, tmp_path / "photo.heic")
     assert tracemalloc.get_traced_memory()[1] < 1 << 20
     tracemalloc.stop()
 
@@ -207,41 +196,6 @@ def test_heic_file_of_gigabytes_is_not_read_for_its_exif_data(tmp_path):
 # Readers and damages
 
 
-DEPTH = np.linspace(1, 2, 48 * 64, dtype=np.float32).reshape(48, 64)
-NOISE = np.random.default_rng(0).integers(1, 60_000, (48, 64, 3)).astype(np.uint16)
-INTRINSICS = {"width": 64, "height": 48, "fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5}
-
-
-def depth_file(path):
-    write_depth_file(path, NOISE[..., 0] if path.suffix == ".png" else DEPTH)
-
-
-def picture(path):
-    cv2.imwrite(str(path), NOISE.astype(np.uint8))
-
-
-def text(content):
-    return lambda path: path.write_text(content)
-
-
-READERS = {
-    **{f"depth{suffix}": (depth_file, read_depth_file) for suffix in DEPTH_SUFFIXES},
-    **{f"photo{suffix}": (picture, photo) for suffix in (".png", ".jpg", ".webp")},
-    "mask.png": (picture, read_mask),
-    "input.npz": (lambda path: write_input(path, torch.rand(3, 48, 64), torch.from_numpy(DEPTH)[None]), read_input),
-    "prediction.npz": (lambda path: np.savez(path, depth=DEPTH, config="{}", seconds=1.0), load_prediction),
-    "camera.json": (text(json.dumps(INTRINSICS)), read_camera),
-    "camera.txt": (text("60 0 31\n0 60 24\n0 0 1"), read_any_camera),
-    "transform.txt": (text("1 0 0 0 0 1 0 0 0 0 1 0"), read_transform),
-    "poses.txt": (text("1 0 0 0 0 1 0 0 0 0 1 0"), read_poses),
-    "weights.pth": (lambda path: torch.save({"weight": torch.rand(2000)}, path), read_torch_file),
-    "weights.safetensors": (
-        lambda path: save_network(path, MSGNet(2, "dsr"), "msg_v"), lambda path: load_network(path, NETWORKS)
-    ),
-    "x.mat": (lambda path: savemat(path, {"depth": DEPTH}, do_compression=True), read_variables),
-    "scan.r3d": (captures.record3d, capture),
-    "key.json": (lambda path: write_key(path, KEY), read_key),
-}  # fmt: skip
 DAMAGES = {
     "missing": None,
     "empty": lambda _: b"",
@@ -523,14 +477,25 @@ def test_configuration_of_10000_nested_lists_is_refused_at_once(tmp_path):
         read_plain_yaml(path)
 
 
-@pytest.mark.parametrize("content", ["3.5", "name: tgv\nsharpness: !!set {a, b}\n"])
-def test_unusable_file_of_a_method_is_named_by_the_commands(tmp_path, capfd, content):
-    (tmp_path / "method").mkdir()
-    (tmp_path / "method" / "mine.yaml").write_text(content)
+@pytest.mark.parametrize(("content", "reason"), [
+    (b"3.5", ""), (b"name: tgv\nsharpness: !!set {a, b}\n", ""), (b"a: \x83", "UnicodeDecodeError"),
+    (b"[" * 3000, "RecursionError"),
+])  # fmt: skip
+def test_unusable_file_of_a_method_is_named(tmp_path, monkeypatch, capfd, content, reason):
+    path = tmp_path / "conf" / "method" / "mine.yaml"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(content)
+    said = refusal(path, lambda: read_recipe("mine", directories=[tmp_path / "conf"]))
+    assert reason in said
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:
-        run_command("eval", Mock(), ["--config-dir", str(tmp_path), "method=mine"])
+        run_command("eval", Mock(), ["--config-dir", str(tmp_path / "conf"), "method=mine"])
     assert ended.value.code == 2
-    assert f"{tmp_path}/method/mine.yaml: expected" in capfd.readouterr().err
+    error = capfd.readouterr().err
+    assert error.startswith("error: ")
+    assert f"{path}: expected" in error
+    assert reason in error
 
 
 # Maps, weights, archives and captures
@@ -594,6 +559,45 @@ def test_weights_without_plain_values_are_refused(tmp_path, tensor):
     assert "expected a torch file" in refusal(path, load_msg_weights, path, 4)
 
 
+class OneWeight(lightning.LightningModule):
+    """A training of one number."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(1))
+
+    def training_step(self, batch, _):
+        return (self.weight - batch).square().sum()
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), 0.1)
+
+
+@pytest.mark.parametrize("content", [{"state_dict": {}}, [1], {"epoch": 1, "global_step": 2}])
+def test_checkpoint_of_something_else_is_refused(tmp_path, content):
+    torch.save(content, tmp_path / "last.ckpt")
+    trainer = make_trainer(torch.device("cpu"), 1, 1, callbacks=[], logger=False, default_root_dir=tmp_path)
+    with pytest.raises(ValueError, match=r"last\.ckpt: expected a checkpoint of this training") as refused:
+        fit(trainer, OneWeight(), [torch.ones(1)], tmp_path / "last.ckpt")
+    assert "\n" not in str(refused.value)
+
+
+class Defective(lightning.Callback):
+    def on_train_start(self, *_):
+        raise RuntimeError("defective")
+
+
+def test_defect_of_a_callback_is_not_taken_for_a_damaged_checkpoint(tmp_path):
+    given = {"logger": False, "default_root_dir": tmp_path}
+    trainer = make_trainer(torch.device("cpu"), 1, 1, callbacks=[], **given)
+    numbers = DataLoader(torch.ones(2, 1), batch_size=None)
+    fit(trainer, OneWeight(), numbers)
+    trainer.save_checkpoint(tmp_path / "last.ckpt")
+    trainer = make_trainer(torch.device("cpu"), 2, 1, callbacks=[Defective()], **given)
+    with pytest.raises(RuntimeError, match="defective"):
+        fit(trainer, OneWeight(), numbers, tmp_path / "last.ckpt")
+
+
 def external(file, secret):
     file.create_dataset("depth", (4, 4), "f8", external=[(str(secret), 0, 128)])
 
@@ -611,7 +615,7 @@ def test_matrix_of_another_file_is_not_read(tmp_path, fill):
 
 
 def nameless(content):
-    """Take the name `abc` off the central directory's only entry of an archive."""
+    """Take the name `üc` off the central directory's only entry of an archive."""
     entry, end = content.index(b"PK\x01\x02"), content.index(b"PK\x05\x06")
     directory, tail = bytearray(content[entry : entry + 46] + content[entry + 49 : end]), bytearray(content[end:])
     struct.pack_into("<H", directory, 28, 0)
@@ -627,11 +631,15 @@ def displaced(content):
     return changed
 
 
-@pytest.mark.parametrize("damage", [nameless, displaced, lambda content: content[:-30]])
+def named_in_no_encoding(content):
+    return content.replace("ü".encode(), b"\xcf\x20")
+
+
+@pytest.mark.parametrize("damage", [nameless, displaced, named_in_no_encoding, lambda content: content[:-30]])
 def test_damaged_archive_is_refused_and_nothing_unpacked(tmp_path, damage):
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as file:
-        file.writestr("abc", b"x" * 100)
+        file.writestr("üc", b"x" * 100)
     path = tmp_path / "data.zip"
     path.write_bytes(damage(packed.getvalue()))
     refusal(path, unpack, path, tmp_path / "out", Mock())
@@ -676,12 +684,19 @@ def test_loop_of_links_among_answers_is_one_file_and_no_error(tmp_path):
     assert tmp_path / "c.json" in files_of([tmp_path])
 
 
+def test_printable_replaces_what_controls_a_terminal_or_turns_text():
+    assert printable("a\x1b[2Jb\x00\x85\u202e").replace("\N{REPLACEMENT CHARACTER}", "#") == "a#[2Jb###"
+    assert printable("Küche 日本 \u200d\n") == "Küche 日本 \u200d\n"
+
+
 def test_long_message_keeps_the_name_at_its_beginning_and_its_end(capsys):
     print_error(f"/data/camera.json: expected a number, got {'9' * 10_000} at the end")
     line = capsys.readouterr().err
     assert len(line) <= len("\n") + 1000
     assert line.startswith("error: /data/camera.json: expected a number, got 999")
     assert line.endswith("9 at the end\n")
-    assert one_line(ValueError("short\nmessage")) == "short message"
+    assert one_line(ValueError("short\nmes\x1bsage\u202e")) == "short mes#sage#".replace(
+        "#", "\N{REPLACEMENT CHARACTER}"
+    )
     print_error("a\x1b]0;title\x07b\x9bc\nd")
     assert capsys.readouterr().err == "error: a#]0;title#b#c d\n".replace("#", "\N{REPLACEMENT CHARACTER}")

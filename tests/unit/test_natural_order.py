@@ -81,21 +81,6 @@ def replica(folder, style):
     return folder
 
 
-def tum(folder, style):
-    """Write lists of TUM that name files of any names, by time."""
-    lines = {"rgb": [], "depth": [], "groundtruth": []}
-    for number in range(FRAMES):
-        name, time = named(style, number), f"{95.5 + number / 8:.4f}"
-        captures.save(folder / "rgb" / f"{name}.png", captures.photo(number))
-        captures.save(folder / "depth" / f"{name}.png", 5 * captures.millimetres(number))
-        for kind in ("rgb", "depth"):
-            lines[kind].append(f"{time} {kind}/{name}.png")
-        lines["groundtruth"].append(f"{time} {0.1 * number} 0 0 0 0 0 1")
-    for kind, each in lines.items():
-        (folder / f"{kind}.txt").write_text("\n".join(each) + "\n")
-    return folder
-
-
 def zipped(folder, style):
     """Write a ZIP file of a capture of Polycam."""
     renamed(captures.polycam(folder), style, first=1000)
@@ -117,7 +102,7 @@ CAPTURES = {
     "sens": (lambda folder, _: captures.sens(folder / "scene.sens"), ["plain"]),
     "scanner app": (lambda folder, style: captures.scanner_app(folder, partial(named, style)), NUMBERS),
     "replica": (replica, NUMBERS),
-    "tum": (tum, list(NAMES)),
+    "tum": (lambda folder, style: captures.tum(folder, partial(named, style)), list(NAMES)),
     "zip": (zipped, list(NAMES)),
 }
 
