@@ -127,8 +127,8 @@ def test_report_without_truth_has_pictures_and_no_tables(
     [
         (["--methods", "DIP"], "methods: expected some of Bicubic, MSG-V, got DIP"),
         (["--scale", "8"], "scales: expected some of 4, got 8"),
-        (["--only", "tables,graphs"], "--only: expected some of tables, metrics, figures, page, got graphs"),
-        (["--light", "e5"], "--light: expected one of e1, e2, e3, e4, got e5"),
+        (["--only", "tables,graphs"], "--only: expected some of tables, metrics, figures, page, got 'graphs'"),
+        (["--light", "e5"], "--light: expected one of e1, e2, e3, e4, got 'e5'"),
         (["--page-px", "0"], "--page-px: expected at least 16, got 0"),
         (["--study", "absent.csv"], "absent.csv: "),
     ],
