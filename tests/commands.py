@@ -47,7 +47,7 @@ class Program:
     Args:
         arguments: the program's path, or ``-m`` and a module's name, and its arguments.
         cwd: directory that it runs in.
-        env: its environment; None for that of the tests.
+        env: its environment; None for that of the tests with one thread, and without what changes scores and errors.
 
     Attributes:
         pid: number of the process, which leads a group of its own.
@@ -61,7 +61,10 @@ class Program:
         self._folder = tempfile.TemporaryDirectory()
         self._outputs = [Path(self._folder.name) / name for name in ("stdout", "stderr")]
         stdout, stderr = map(str, self._outputs)
-        environment = dict(os.environ if env is None else env)
+        environment = dict(env or {**os.environ, "OMP_NUM_THREADS": "1"})
+        if env is None:
+            for name in ("DSR_LPIPS_TRUNK", "HYDRA_FULL_ERROR"):
+                environment.pop(name, None)
         self.pid: int = _ask({"arguments": arguments, "cwd": str(cwd), "env": environment, "stdout": stdout,
                               "stderr": stderr})  # fmt: skip
         self._handle = os.pidfd_open(self.pid)

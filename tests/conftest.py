@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from browser_pages import Window
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.evaluation.results import prediction_path, sample_path
@@ -171,6 +172,20 @@ def webgl_browser(browser: Any) -> Iterator[Any]:
     started = browser.browser_type.launch(executable_path=path, args=plain + graphics)
     yield started
     started.close()
+
+
+@pytest.fixture
+def window(webgl_browser: Any) -> Iterator[Callable[..., Window]]:
+    """Return what opens a window, of another browser or with options; what its page does wrong fails the test."""
+    windows: list[Window] = []
+
+    def make(browser: Any = webgl_browser, **options: Any) -> Window:
+        windows.append(Window(browser, **options))
+        return windows[-1]
+
+    yield make
+    for each in windows:
+        each.close()
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 from small_results import waves
+from upsampling import upsample
 
 from dsr.app.browser import Work, offered
 from dsr.app.requests import BrowserRequest
@@ -74,8 +75,8 @@ def test_pair_becomes_what_the_command_makes_of_it(pair, folder, tmp_path):
     assert said.endswith("-> dsr-result\n")
     assert 'sandbox="allow-scripts"' in page
     assert {"view.html", "info.json", "mesh.glb"} <= {path.name for path in here.iterdir()}
-    command = ["upsample", "--rgb", pair[0], "--depth", pair[1], "--method", "bicubic", "--fill", "all"]
-    assert main([*command, "--depth-unit", "1/500", "--fov", "70", "-o", str(tmp_path / "out")]) == 0
+    command = ("--rgb", pair[0], "--depth", pair[1], "--method", "bicubic", "--fill", "all")
+    assert upsample(*command, "--depth-unit", "1/500", "--fov", "70", "-o", tmp_path / "out") == 0
     of_page, of_command = (read_result(place, "") for place in (here, tmp_path / "out"))
     assert np.array_equal(of_page.depth, of_command.depth, equal_nan=True)
     middle = show_length(float(np.nanmedian(of_page.depth_error)), 2)
@@ -86,7 +87,8 @@ def test_frame_of_a_capture_is_chosen(folder, tmp_path):
     scan, work = str(captures.record3d(tmp_path / "scan.r3d")), Work(BrowserRequest(), folder)
     none = (None, None, None, None)
     assert "from 1 to 3, got 4" in refusal(work.compute(scan, *none, 4, *QUICK))
-    *_, result = results_of(work.compute(scan, *none, 3, *QUICK), tmp_path)
+    said, *_, result = results_of(work.compute(scan, *none, 3, *QUICK), tmp_path)
+    assert "frames 3 to 3 of 3" in said
     (found,) = find_results(result)
     assert np.nanmedian(read_result(found, "").depth) == pytest.approx(np.median(captures.depth(2)), abs=0.02)
 
@@ -105,15 +107,11 @@ def bomb(path):
         bombs.zeros(packed, "depth.npy", b"", bombs.LARGE)
 
 
-@pytest.mark.parametrize(("write", "reason"), [(link, "refused"), (bomb, "bytes")])
-def test_hostile_archive_is_refused_in_one_line_and_leaves_nothing(folder, tmp_path, write, reason):
-    write(tmp_path / "hostile.zip")
-    given = (str(tmp_path / "hostile.zip"), None, None, None, None, 1, *QUICK)
-    assert reason in refusal(Work(BrowserRequest(), folder).compute(*given))
-
-
-def test_incomplete_input_and_wrong_choices_are_refused_in_one_line(pair, folder):
+def test_hostile_archives_incomplete_input_and_wrong_choices_are_refused_in_one_line(pair, folder, tmp_path):
     work = Work(BrowserRequest(), folder)
+    for write, reason in ((link, "refused"), (bomb, "bytes")):
+        write(tmp_path / "hostile.zip")
+        assert reason in refusal(work.compute(str(tmp_path / "hostile.zip"), None, None, None, None, 1, *QUICK))
     assert "a photo and a depth map, or a capture" in refusal(work.compute(None, pair[0], None, None, None, 1, *QUICK))
     assert "--fov" in refusal(work.compute(None, *pair, 1, "", "", "", "-1", "bicubic", "small", ""))
 
@@ -154,7 +152,7 @@ def served(tmp_path):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="needs signals of POSIX")
-def test_page_takes_pairs_and_captures_and_asks_nobody_else(served, webgl_browser, pair, tmp_path_factory):
+def test_page_takes_pairs_refuses_wrong_files_and_asks_nobody_else(served, webgl_browser, pair, tmp_path_factory):
     origin = served.rsplit("/", 2)[0]
     for path in ("/", "/gradio_api/info", "/config", "/docs"):  # without the token
         with pytest.raises(urllib.error.HTTPError, match="404"):
@@ -184,18 +182,9 @@ def test_page_takes_pairs_and_captures_and_asks_nobody_else(served, webgl_browse
     page.get_by_label("Clear").click()
     page.get_by_label("wrong.zip").wait_for(state="detached")
 
-    give(".r3d", captures.record3d(place / "scan.r3d"))
-    page.get_by_label("Frame of the capture").fill("2")
-    compute.click()
-    page.frame_locator("iframe").locator("#stage[data-shown]").wait_for()
-    assert "frames 2 to 2 of 3" in said.input_value()
-    page.get_by_label("Clear").click()
-    page.get_by_label("scan.r3d").wait_for(state="detached")
-
     give(".ppm", Path(pair[0]))
     give(".pfm", Path(pair[1]))
     compute.click()
-    page.locator("iframe").wait_for(state="detached")
     page.frame_locator("iframe").locator("#stage[data-shown]").wait_for()
     assert said.input_value().startswith("photo.png and depth.png\n")
     assert "degrees" in page.get_by_role("table").filter(has_text="expected error").inner_text()

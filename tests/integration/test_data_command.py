@@ -1,5 +1,6 @@
 """``dsr data`` as it is typed: what it says, fetches and leaves, and how it ends."""
 
+import contextlib
 import os
 import pty
 import select
@@ -11,6 +12,7 @@ import time
 from http.server import BaseHTTPRequestHandler
 
 import pytest
+from upsampling import refused_line
 
 from dsr import cli
 from dsr.data.download import fetching
@@ -41,11 +43,8 @@ class Mirror(BaseHTTPRequestHandler):
         self.wfile.write(content[start:half])
         self.wfile.flush()
         self.server.go_on.wait(30)
-        with_rest = content[half:]
-        try:
-            self.wfile.write(with_rest)
-        except OSError:  # it has gone
-            self.close_connection = True
+        with contextlib.suppress(OSError):  # it has gone
+            self.wfile.write(content[half:])
 
     def log_message(self, *_):
         pass
@@ -76,14 +75,7 @@ def run(*arguments):
     return subprocess.run(command(*arguments), capture_output=True, text=True, timeout=60, check=False)
 
 
-def in_process(capsys, *arguments, catalogue=None):
-    """Return the exit code and the lines of both streams."""
-    code = cli.main(arguments, catalogue)
-    said = capsys.readouterr()
-    return code, said.out.splitlines(), said.err.splitlines()
-
-
-def test_dataset_is_fetched_listed_verified_and_not_fetched_twice(mirror, root):
+def test_dataset_is_fetched_listed_verified_and_not_fetched_twice(mirror, root, capsys):
     done = run("data", "get", "middlebury2003", "--mirror", mirror.url)
     assert (done.returncode, done.stderr) == (0, "")
     lines = done.stdout.splitlines()
@@ -96,41 +88,30 @@ def test_dataset_is_fetched_listed_verified_and_not_fetched_twice(mirror, root):
         assert (root / name).read_bytes() == PNG + name.encode()
     assert [path for path, _ in mirror.log] == [f"/{name}" for name in NAMES]
 
-    listed = run("data", "list")
-    assert (listed.returncode, listed.stderr) == (0, "")
-    rows = {line.split()[0]: line for line in listed.stdout.splitlines()}
+    assert cli.main(["data", "list"]) == 0
+    rows = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
     assert rows["middlebury2003"].split()[-2:] == ["complete", "noted"]
     assert rows["middlebury2006"].split()[-2:] == ["absent", "unknown"]
     assert rows["tofmark"].split()[-2:] == ["manual", "unknown"]
 
-    checked = run("data", "verify", "middlebury2003")
-    assert (checked.returncode, checked.stdout, checked.stderr) == (0, "middlebury2003: complete, as recorded\n", "")
+    assert cli.main(["data", "verify", "middlebury2003"]) == 0
+    assert capsys.readouterr() == ("middlebury2003: complete, as recorded\n", "")
 
-    again = run("data", "get", "middlebury2003", "--mirror", mirror.url)
-    assert again.returncode == 0
-    assert f"0 of 4 files are missing in {root}" in again.stdout
+    assert cli.main(["data", "get", "middlebury2003", "--mirror", mirror.url]) == 0
+    assert f"0 of 4 files are missing in {root}" in capsys.readouterr().out
     assert len(mirror.log) == 4
 
 
 def test_interrupted_command_resumes(mirror, root):
     mirror.go_on.clear()
     get = ("data", "get", "middlebury2003", "--mirror", mirror.url)
-    process = subprocess.Popen(
-        command(*get),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # noqa: PLW1509
-    )
+    process = subprocess.Popen(command(*get), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     part, end = root / f"{NAMES[0]}.part", time.monotonic() + 30
     while time.monotonic() < end and not (part.is_file() and part.stat().st_size):
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=30)
-    assert (process.returncode, errors) == (
-        130,
-        "interrupted; what is finished is kept, the same command continues from there\n",
-    )
+    assert (process.returncode, errors.count("\n")) == (130, 1)
     had = part.stat().st_size
     assert not (root / NAMES[0]).exists()
     mirror.go_on.set()
@@ -143,13 +124,9 @@ def test_interrupted_command_resumes(mirror, root):
 def test_command_asks_before_the_first_byte_on_a_terminal(mirror, root):
     for answer, code, there in ((b"n\n", 0, False), (b"y\n", 0, True)):
         ours, theirs = pty.openpty()
-        process = subprocess.Popen(
-            command("data", "get", "middlebury2003", "--mirror", mirror.url),
-            stdin=theirs,
-            stdout=theirs,
-            stderr=theirs,
-            env={**os.environ, "TERM": "xterm", "COLUMNS": "100"},
-        )
+        get = command("data", "get", "middlebury2003", "--mirror", mirror.url)
+        environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100"}
+        process = subprocess.Popen(get, stdin=theirs, stdout=theirs, stderr=theirs, env=environment)
         os.close(theirs)
         said = b""
         while b"[Y/n]" not in said:
@@ -168,23 +145,22 @@ def test_command_asks_before_the_first_byte_on_a_terminal(mirror, root):
 
 def drain(terminal):
     """Read until the other side is closed."""
-    try:
+    with contextlib.suppress(OSError):  # how Linux says so
         while os.read(terminal, 1024):
             pass
-    except OSError:  # how Linux says so
-        pass
 
 
 def test_locations_of_the_datasets_are_printed(root, capsys):
-    code, lines, _ = in_process(capsys, "data", "where")
-    assert (code, lines[0]) == (0, str(root))
-    assert ["icl", str(root / "icl_nuim")] in [line.split() for line in lines[1:]]
-    assert in_process(capsys, "data", "where", "icl") == (0, [str(root / "icl_nuim")], [])
+    assert cli.main(["data", "where"]) == 0
+    first, *lines = capsys.readouterr().out.splitlines()
+    assert first == str(root)
+    assert ["icl", str(root / "icl_nuim")] in [line.split() for line in lines]
+    assert cli.main(["data", "where", "icl"]) == 0
+    assert capsys.readouterr() == (f"{root / 'icl_nuim'}\n", "")
 
 
-@pytest.mark.parametrize("task", ["get", "verify", "where"])
-def test_unknown_name_is_one_line_with_the_known_ones(root, capsys, task):
-    code, lines, errors = in_process(capsys, "data", task, "middelbury")
-    assert (code, lines, len(errors)) == (2, [], 1)
-    assert errors[0].startswith("error: middelbury: unknown data set; expected some of middlebury, middlebury_train, ")
+def test_unknown_name_is_one_line_with_the_known_ones(root, capsys):
+    for task in ("get", "verify", "where"):
+        line = refused_line(capsys, cli.main(["data", task, "middelbury"]))
+        assert line.startswith("middelbury: unknown data set; expected some of middlebury, ")
     assert not root.exists()

@@ -131,23 +131,12 @@ def test_examples_of_a_method_a_data_set_and_a_metric_run_together(extension: Pa
     assert set(pd.read_csv(extension / "run" / "scores.csv")["method"]) == {"blend"}
 
 
-def test_example_of_a_network_trains(extension: Path, dsr_cache: Path) -> None:
+@pytest.mark.nightly
+def test_examples_of_a_network_an_optimiser_and_a_callback_train(extension: Path, dsr_cache: Path) -> None:
     small = ("trainer=smoke", "dataset.size=64", "dataset.count=8", "metrics.lpips=false", "device=cpu")
     run_example("train.py", extension, *small)
     assert (extension / "outputs" / "train" / "tiny" / "weights.safetensors").is_file()
-
-
-@pytest.mark.nightly
-def test_example_of_an_optimiser_and_a_callback_trains(extension: Path, dsr_cache: Path) -> None:
-    small = (
-        "trainer=smoke",
-        "dataset.size=64",
-        "dataset.count=8",
-        "metrics.lpips=false",
-        "device=cpu",
-        "output_dir=more",
-    )
-    run_example("optimizer=rprop", extension, *small)
+    run_example("optimizer=rprop", extension, *small, "output_dir=more")
     assert "Rprop" in (extension / "more" / "config.yaml").read_text()
 
 

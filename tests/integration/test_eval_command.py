@@ -5,7 +5,6 @@ import json
 import os
 import re
 import signal
-import sys
 import time
 from pathlib import Path
 
@@ -41,13 +40,9 @@ def quick(arguments):
     return arguments if named else (*arguments, "method=bicubic")
 
 
-def command(*arguments):
-    return [sys.executable, str(REPOSITORY / "eval.py"), *quick(arguments)]
-
-
 def run(folder, environment, *arguments):
     """Run the command in a process of its own."""
-    return run_python(*command(*arguments)[1:], cwd=folder, env=environment)
+    return run_python(str(REPOSITORY / "eval.py"), *quick(arguments), cwd=folder, env=environment)
 
 
 @pytest.fixture
@@ -102,28 +97,18 @@ def default_run(tmp_path_factory, offline):
     return folder, home, done
 
 
-def test_default_run_succeeds_and_names_its_results(default_run):
-    _, home, done = default_run
+def test_default_run_writes_the_documented_files_and_nothing_else(default_run):
+    folder, home, done = default_run
     assert done.returncode == 0, done.stderr
     assert home.name.startswith("bicubic_x4_simgeo_size64")
     assert done.stdout.splitlines()[-1] == f"results: outputs/eval/{home.name}"
-    assert "statue" in done.stdout
-    assert "mean" in done.stdout
-
-
-def test_default_run_writes_the_documented_files_and_nothing_else(default_run):
-    folder, home, _ = default_run
+    assert {"statue", "mean"} <= set(done.stdout.split())
     assert tree(home) == written(SIMGEO)
     assert [path.name for path in folder.iterdir()] == ["outputs"]
-
-
-def test_missing_lpips_trunk_is_one_line_with_advice(default_run):
-    _, _, done = default_run
-    assert done.stderr.count("LPIPS_v is left out") == 1
-    [line] = done.stderr.splitlines()
-    assert "alexnet-owt-7be5be79.pth" in line
+    [line] = done.stderr.splitlines()  # nowhere to get the network of LPIPS from
+    assert "LPIPS_v is left out" in line
     assert "metrics.lpips_trunk=FILE" in line
-    assert done.stdout.count("LPIPS") == 0
+    assert "LPIPS" not in done.stdout
 
 
 def test_second_run_reuses_the_predictions_and_says_so(default_run, within, monkeypatch):
@@ -139,21 +124,26 @@ def test_second_run_reuses_the_predictions_and_says_so(default_run, within, monk
     assert rows(home) == table
 
 
-def test_bad_scene_keeps_the_others_results_and_sets_the_exit_code(tmp_path, within):
+def test_bad_scene_keeps_the_others_results_and_is_added_once_it_is_repaired(tmp_path, within):
     for number, name in enumerate(("first", "bad one", "last")):
         write_scene(tmp_path / "data" / name, seed=number)
-    (tmp_path / "data" / "bad one" / "rgb.png").write_bytes(b"\x89PNG\r\n\x1a\nbroken")
-    code, output, errors = within("dataset=folder", "dataset.root=data", "output_dir=out")
-    assert code == 2
-    assert errors == [
-        "error: data/bad one/rgb.png: expected a picture, got a damaged or foreign file of 14 bytes",
-        "error: 1 of 3 scenes failed: bad one; the others are in out",
-    ]
+    photo = tmp_path / "data" / "bad one" / "rgb.png"
+    content = photo.read_bytes()
+    photo.write_bytes(b"\x89PNG\r\n\x1a\nbroken")
+    arguments = ("dataset=folder", "dataset.root=data", "output_dir=out", "weights=x")
+    code, _, errors = within(*arguments)
+    assert (code, len(errors)) == (2, 3)
+    assert errors[0] == "note: method=bicubic has no weights; weights=x is not used"
+    assert errors[1].startswith("error: data/bad one/rgb.png: expected a picture")
+    assert errors[2].startswith("error: 1 of 3 scenes failed: bad one")
     assert tree(tmp_path / "out") == written(["first", "last"])
     assert {row["scene"] for row in rows(tmp_path / "out")} == {"first", "last"}
     assert list(json.loads((tmp_path / "out" / "summary.json").read_text())["failures"]) == ["bad one"]
-    assert "first" in output
-    assert "last" in output
+    photo.write_bytes(content)
+    code, output, errors = within(*arguments)
+    assert (code, errors) == (0, errors[:1])
+    assert "predictions re-used: 2" in output
+    assert tree(tmp_path / "out") == written(["bad one", "first", "last"])
 
 
 def test_folders_of_predictions_are_judged_as_methods_are(tmp_path, within):
@@ -183,21 +173,6 @@ def test_folders_of_predictions_are_judged_as_methods_are(tmp_path, within):
     np.save(tmp_path / "mine" / "first.npy", 1.01 * np.load(tmp_path / "mine" / "first.npy"))
     code, _, errors = within(*data, "method=external", "method.path=mine")
     assert (code, "made with another method_content" in errors[-1]) == (2, True)
-
-
-def test_repaired_scene_is_added_by_the_same_command(tmp_path, within):
-    write_scene(tmp_path / "data" / "a")
-    camera = write_scene(tmp_path / "data" / "b") / "camera.json"
-    content = camera.read_text()
-    camera.write_text("{}")
-    arguments = ("dataset=folder", "dataset.root=data", "output_dir=out")
-    code, _, errors = within(*arguments)
-    assert (code, errors[0].startswith("error: data/b/camera.json: width: ")) == (2, True)
-    camera.write_text(content)
-    code, output, errors = within(*arguments)
-    assert (code, errors) == (0, [])
-    assert "predictions re-used: 1" in output
-    assert tree(tmp_path / "out") == written(["a", "b"])
 
 
 def test_aligned_scores_are_a_result_of_their_own_and_say_so(tmp_path, within):
@@ -251,29 +226,20 @@ def test_errors_that_a_method_states_are_scored_and_scaled_with_the_prediction(t
 
 USAGE_ERRORS = {
     "an added key": (["+scal=8"], "scal: unknown key; expected one of names, "),
-    "an added key of a group": (["+method.sharp=1"], "method.sharp: unknown key; method=bicubic takes order, "),
     "a group taken away": (["~method"], "method: missing"),
     "a scale that is none": (["scale=3"], "scale: "),
-    "a type in a group": (["dataset.size=big"], "dataset.size: expected integer, got 'big'"),
-    "a range": (["dataset.size=8"], "dataset.size: "),
-    "a device that is not here": (["device=gpu"], "device: expected auto, cpu or a device of this machine"),
     "no worker": (["workers=0"], "workers: "),
     "half a thread": (["threads=0.5"], "threads: "),
+    "an unknown alignment": (["metrics.alignment=median"], "metrics.alignment: expected one of"),
     "no root": (["dataset=folder"], "dataset.root: dataset=folder needs it: dataset.root=..."),
     "a missing root": (["dataset=folder", "dataset.root=no where"], "dataset.root: expected a directory of scenes"),
     "an unknown scene": (["dataset.scenes=[mars]"], "dataset.scenes: "),
     "no weights": (["method=msg_v", "scale=16"], "weights: method=msg_v: "),
     "a mixture": (["dataset=mixture"], "dataset=mixture: "),
-    "a noise that cannot be": (["noise=gaussian_multiplicative", "noise.std=2"], "noise.std: "),
     "missing weights": (["method=msg_v", "weights=no.pth"], "weights: method=msg_v: expected a file of weights"),
-    "a directory without": (["method=msg", "weights=empty"], "weights: method=msg: expected a file of weights, got"),
     "foreign weights": (["method=msg_v", "weights=file"], "file: expected "),
     "authors' weights": (["method=pgsr"], "weights: method=pgsr: "),
-    "foreign authors' weights": (["method=svlrm", "weights=file"], "file: "),
     "a missing trunk": (["metrics.lpips_trunk=no"], "metrics.lpips_trunk: expected a file, got no"),
-    "a foreign trunk": (["metrics.lpips_trunk=file"], "metrics.lpips_trunk: file: expected the weights"),
-    "an unknown alignment": (["metrics.alignment=median"], "metrics.alignment: expected one of none, scale, affine, "),
-    "a file as directory": (["output_dir=file"], "output_dir: file: expected a folder to write, got a file"),
     "a foreign directory": (["output_dir=foreign"], "output_dir: foreign holds files of something else"),
 }
 
@@ -281,33 +247,23 @@ USAGE_ERRORS = {
 @pytest.mark.parametrize("case", USAGE_ERRORS)
 def test_usage_error_is_one_line_with_exit_code_2_and_writes_nothing(tmp_path, within, case):
     arguments, start = USAGE_ERRORS[case]
-    (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("no weights")
     (tmp_path / "foreign").mkdir()
     (tmp_path / "foreign" / "thesis.txt").write_text("precious")
     code, output, errors = within(*arguments, lpips="trunk" in case)
-    assert code == 2
-    assert output == ""
-    assert len(errors) == 1, errors
+    assert (code, output, len(errors)) == (2, "", 1), errors
     assert errors[0].startswith(f"error: {start}")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "foreign"]
     assert tree(tmp_path) == ["file", "foreign/thesis.txt"]
-    assert not (tmp_path / "outputs").exists()
 
 
-def test_usage_error_of_the_real_command_is_one_line(tmp_path, offline):
-    done = run(tmp_path, offline, "dataset=folder", "dataset.root=nowhere")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "error: dataset.root: expected a directory of scenes, got nowhere (no such directory)\n"
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_default_method_is_msg_v_with_packaged_weights(tmp_path, offline):
-    arguments = ("dataset.size=64", "dataset.scenes=[statue,cube_no_texture]", "metrics.lpips=false")
-    done = run_python(str(REPOSITORY / "eval.py"), *arguments, cwd=tmp_path, env=offline)
-    assert (done.returncode, done.stderr) == (0, "")
+def test_default_method_is_msg_v_with_packaged_weights(tmp_path, in_process, within):
+    arguments = ("dataset.size=64", "dataset.scenes=[statue,cube_no_texture]")
+    code, _, errors = in_process("eval", *arguments, "metrics.lpips=false")
+    assert (code, errors) == (0, [])
     [home] = (tmp_path / "outputs" / "eval").iterdir()
     assert home.name.startswith("msg_v_x4_simgeo_")
-    assert run(tmp_path, offline, *arguments, "output_dir=bicubic").returncode == 0
+    assert within(*arguments, "output_dir=bicubic")[0] == 0
     ours, theirs = (
         json.loads((folder / "summary.json").read_text())["mean"] for folder in (home, tmp_path / "bicubic")
     )
@@ -315,14 +271,8 @@ def test_default_method_is_msg_v_with_packaged_weights(tmp_path, offline):
         assert ours[name] < 0.9 * theirs[name], name
 
 
-def test_weights_that_a_method_does_not_use_are_noted(tmp_path, within):
-    write_scene(tmp_path / "data" / "a")
-    code, _, errors = within("dataset=folder", "dataset.root=data", "weights=x y")
-    assert (code, errors) == (0, ["note: method=bicubic has no weights; weights=x y is not used"])
-
-
-@pytest.mark.parametrize("name", ["a b", "ünï [red]", "$x$"])
-def test_scene_may_have_any_name(tmp_path, within, name):
+def test_scene_may_have_any_name(tmp_path, within):
+    name = "ünï [red] $x$"
     write_scene(tmp_path / "data" / name)
     code, output, errors = within("dataset=folder", "dataset.root=data", "output_dir='o [bold]'")
     assert (code, errors) == (0, [])
@@ -331,7 +281,7 @@ def test_scene_may_have_any_name(tmp_path, within, name):
     assert "results: o [bold]" in output
 
 
-@pytest.mark.parametrize(("size", "ratio"), [((40, 48), "1"), ((15, 18), "2.667"), ((10, 12), "4")])
+@pytest.mark.parametrize(("size", "ratio"), [((15, 18), "2.667"), ((10, 12), "4")])
 def test_measured_map_of_any_size_is_upsampled_at_its_own_ratio(tmp_path, within, size, ratio):
     write_scene(tmp_path / "data" / "a", height=40, width=48)
     np.save(tmp_path / "data" / "a" / "depth_lr.npy", np.full(size, 2.0, np.float32))
@@ -341,8 +291,7 @@ def test_measured_map_of_any_size_is_upsampled_at_its_own_ratio(tmp_path, within
     assert f"Bicubic on folder, x{ratio}, measured downsampling" in output
     (folder,) = (tmp_path / "outputs" / "eval").iterdir()
     assert folder.name.startswith(f"bicubic_x{ratio}_folder_measured_")
-    with (folder / "scores.csv").open(newline="") as file:
-        assert {row["scale"] for row in csv.DictReader(file)} == {ratio}
+    assert {row["scale"] for row in rows(folder)} == {ratio}
     with np.load(folder / "predictions" / "a.npz") as kept:
         np.testing.assert_allclose(kept["depth"], 2.0, rtol=0.02)
     code, output, errors = within(*arguments, f"scale={ratio}")
@@ -353,49 +302,46 @@ def test_measured_map_of_any_size_is_upsampled_at_its_own_ratio(tmp_path, within
 def test_scale_that_names_no_measured_map_is_refused(tmp_path, within):
     write_scene(tmp_path / "data" / "a", height=40, width=48)
     arguments = ("dataset=folder", "dataset.root=data", "downsampling=measured")
-    message = "expects a low-resolution map, exactly one, there is none"
-    assert within(*arguments, "scale=native")[::2] == (2, [f"error: a: downsampling=measured scale=native {message}"])
+    message = "error: a: downsampling=measured scale=native expects a low-resolution map"
+    code, _, [line] = within(*arguments, "scale=native")
+    assert (code, line.startswith(message)) == (2, True)
     np.save(tmp_path / "data" / "a" / "depth_lr.npy", np.full((15, 18), 2.0, np.float32))
-    message = "expects a low-resolution map at x2.5, the scene has x2.667"
-    assert within(*arguments, "scale=2.5")[::2] == (2, [f"error: a: downsampling=measured {message}"])
-    code, _, errors = within(*arguments, "scale=0.5")
-    assert code == 2
-    assert errors == ["error: scale: expected native or the ratio of the measured maps, 1 or more, got 0.5"]
+    for scale, message in (("2.5", "a: downsampling=measured expects"), ("0.5", "scale: expected native or")):
+        code, _, [line] = within(*arguments, f"scale={scale}")
+        assert (code, line.startswith(f"error: {message}")) == (2, True)
 
 
+@pytest.mark.nightly
 def test_interrupted_run_keeps_finished_scenes_and_resumes(tmp_path, offline):
-    arguments = ("dataset=simgeo", "dataset.size=256", "output_dir=out", "metrics.lpips=false")
-    with Program(*command(*arguments)[1:], cwd=tmp_path, env=offline) as process:
+    given = (str(REPOSITORY / "eval.py"), "dataset.size=256", "method=bicubic", "output_dir=out", "metrics.lpips=false")
+    with Program(*given, cwd=tmp_path, env=offline) as process:
         deadline = time.monotonic() + 60
         while not list((tmp_path / "out" / "predictions").glob("[!.]*.npz")) and time.monotonic() < deadline:
             time.sleep(0.02)
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert errors == "interrupted; what is finished is kept, the same command continues from there\n"
-    finished = sorted(path.name for path in (tmp_path / "out" / "predictions").iterdir())
-    assert finished
-    assert len(finished) < 6
-    assert all(not name.startswith(".") for name in finished)
+    assert (process.returncode, errors.count("\n")) == (130, 1)
+    finished = [path.name for path in (tmp_path / "out" / "predictions").iterdir()]
+    assert 0 < len(finished) < 6
+    assert not any(name.startswith(".") for name in finished)
+    assert f"predictions re-used: {len(finished)}" in run_python(*given, cwd=tmp_path, env=offline).stdout
 
 
-def test_several_workers_and_commands_give_the_files_of_one(tmp_path, offline):
-    scenes = ["cube_no_texture", "sphere_cylinder_low_freq", "statue"]
-    shared = ("dataset.size=64", f"dataset.scenes=[{','.join(scenes)}]", "metrics.lpips=false", "threads=1",
-              "method=msg_v")  # fmt: skip
-    assert run(tmp_path, offline, *shared, "workers=1", "output_dir=one").returncode == 0
-    done = run(tmp_path, offline, *shared, "workers=2", "output_dir=two")
+def test_several_workers_give_the_files_of_one(tmp_path, offline, within):
+    scenes = ["cube_no_texture", "statue"]
+    shared = ("dataset.size=64", f"dataset.scenes=[{','.join(scenes)}]", "threads=1", "method=msg_v", "device=cpu")
+    assert within(*shared, "workers=1", "output_dir=one")[::2] == (0, [])
+    done = run(tmp_path, offline, *shared, "metrics.lpips=false", "workers=2", "output_dir=two")
     assert (done.returncode, done.stderr) == (0, "")
-    assert tree(tmp_path / "two") == tree(tmp_path / "one") == written(scenes)
-    scores = [(tmp_path / name / "scores.csv").read_bytes() for name in ("one", "two")]
-    assert scores[0] == scores[1]
+    one, two = tmp_path / "one", tmp_path / "two"
+    assert tree(two) == tree(one) == written(scenes)
+    assert (one / "scores.csv").read_bytes() == (two / "scores.csv").read_bytes()
     for scene in scenes:
-        maps = [np.load(tmp_path / name / "predictions" / f"{scene}.npz")["depth"] for name in ("one", "two")]
-        np.testing.assert_array_equal(*maps)
-    again = run(tmp_path, offline, *shared, "workers=1", "output_dir=two")
-    assert "predictions re-used: 3" in again.stdout
-    summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("one", "two")]
+        depths = [np.load(folder / "predictions" / f"{scene}.npz")["depth"] for folder in (one, two)]
+        np.testing.assert_array_equal(*depths)
+    summaries = [json.loads((folder / "summary.json").read_text()) for folder in (one, two)]
     assert [list(each["seconds"]) for each in summaries] == [scenes] * 2
+    assert "predictions re-used: 2" in within(*shared, "workers=1", "output_dir=two")[1]
 
 
 def test_msg_v_reproduces_the_protocol_on_the_released_scenes(shared, tmp_path, within):
@@ -418,18 +364,12 @@ def test_msg_v_reproduces_the_protocol_on_the_released_scenes(shared, tmp_path, 
     half_a_digit = dict(zip(metrics, (0.06, 0.006, 0.06, 0.6, 0.006, 0.6), strict=True))
     for scene, values in expected.items():
         for metric, value in values.items():
-            assert worst[scene, metric] * factors[metric] == pytest.approx(value, abs=half_a_digit[metric]), (
-                scene,
-                metric,
-            )
+            found = worst[scene, metric] * factors[metric]
+            assert found == pytest.approx(value, abs=half_a_digit[metric]), (scene, metric)
     assert "paper" in output
-
-
-def test_measured_input_is_scored_at_its_valid_pixels(shared, tmp_path, within):
     code, _, errors = within(
-        "dataset=folder", f"dataset.root='{shared / 'scenes'}'", "dataset.scenes=[books]",
-        "downsampling=measured", "output_dir=out",
+        "dataset=folder", f"dataset.root='{shared / 'scenes'}'", "dataset.scenes=[books]", "downsampling=measured",
+        "output_dir=measured",
     )  # fmt: skip
     assert (code, errors) == (0, [])
-    shares = {float(row["valid_share"]) for row in rows(tmp_path / "out")}
-    assert all(0 < share < 1 for share in shares)
+    assert all(0 < float(row["valid_share"]) < 1 for row in rows(tmp_path / "measured"))

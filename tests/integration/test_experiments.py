@@ -19,12 +19,12 @@ def _folder(monkeypatch, tmp_path):
 @pytest.mark.usefixtures("_folder")
 def test_paper_tables_in_small_are_evaluated_and_reported(tmp_path, capfd):
     small = ["dataset.size=64", "dataset.scenes=[statue]", "metrics.lpips=false"]
-    run_eval(["-m", "+experiment=paper_tables", "method=bicubic,eg", *small])
+    run_eval(["-m", "+experiment=paper_tables", "method=bicubic,nearest", *small])
     runs = sorted((tmp_path / "outputs" / "eval").iterdir())
     assert [run.name for run in runs] == [
-        f"{method}_x{scale}_simgeo_scenes-statue_size64_seed0" for method in ("bicubic", "eg") for scale in (4, 8)
+        f"{method}_x{scale}_simgeo_scenes-statue_size64_seed0" for method in ("bicubic", "nearest") for scale in (4, 8)
     ]
     assert "note: left out, as not in" in capfd.readouterr().err
     assert main(["report", "outputs/eval", "-o", "report", "--only", "tables"]) == 0
     with (tmp_path / "report" / "tables" / "simgeo_x4_box.csv").open(newline="", encoding="utf-8") as file:
-        assert {"Bicubic", "EG"} <= {row["method"] for row in csv.DictReader(file)}
+        assert {"Bicubic", "Nearest"} <= {row["method"] for row in csv.DictReader(file)}

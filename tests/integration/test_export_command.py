@@ -2,40 +2,19 @@
 
 import json
 
-import numpy as np
 import pytest
 import trimesh
-from PIL import Image
-from upsampling import upsample
-
-FRAMES = ("000", "001")
+from small_frames import write_frames
+from upsampling import refused_line, upsample
 
 
 @pytest.fixture
 def capture(tmp_path):
-    """Two frames of 48 x 64, depth of 12 x 16 in millimetres."""
-    rows, columns = np.mgrid[0:12, 0:16]
-    for number, name in enumerate(FRAMES):
-        for folder in ("rgb", "depth"):
-            (tmp_path / "capture" / folder).mkdir(parents=True, exist_ok=True)
-        photo = np.random.default_rng(number).integers(0, 256, (48, 64, 3), np.uint8)
-        Image.fromarray(photo).save(tmp_path / "capture" / "rgb" / f"{name}.png")
-        depth = (1500 + 10 * rows + 5 * columns + 100 * number).astype(np.uint16)
-        Image.fromarray(depth).save(tmp_path / "capture" / "depth" / f"{name}.png")
-    return tmp_path / "capture"
+    return write_frames(tmp_path / "capture", 2, holes=0)
 
 
 def names_in(folder):
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-
-
-def set_poses(out):
-    """Add poses to the frames of a run, as captures have them."""
-    for number, name in enumerate(FRAMES):
-        path = out / name / "info.json"
-        entries = json.loads(path.read_text())
-        entries["pose"] = [[1, 0, 0, number], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-        path.write_text(json.dumps(entries))
 
 
 def test_exports_are_written_beside_the_frames_and_again_after_a_resumption(capture, tmp_path, capsys):
@@ -46,7 +25,10 @@ def test_exports_are_written_beside_the_frames_and_again_after_a_resumption(capt
     frame = {"info.json", "depth.png", "depth_metres.tiff", "rgbd/color.png", "rgbd/depth.png", "rgbd/intrinsic.json"}
     assert names_in(out / "000") == frame
     assert "open3d/trajectory.log" not in names_in(out)
-    set_poses(out)
+    for number in range(2):  # as captures have them
+        path = out / f"{number:03}" / "info.json"
+        pose = [[1, 0, 0, number], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+        path.write_text(json.dumps({**json.loads(path.read_text()), "pose": pose}))
     assert upsample(capture, "--only", "open3d,nerfstudio,gaussian", "-o", out) == 0
     assert "2 complete already" in capsys.readouterr().out
     assert "open3d/trajectory.log" in names_in(out)
@@ -59,17 +41,12 @@ def test_exports_are_written_beside_the_frames_and_again_after_a_resumption(capt
 
 
 @pytest.mark.parametrize("part", ["nerfstudio", "gaussian"])
-@pytest.mark.parametrize("more", [(), ("--dry-run",), ("--poses", "one.txt")])
-def test_frames_without_poses_are_refused_before_anything_is_computed(
-    capture, tmp_path, capsys, part, more, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
+def test_frames_without_poses_are_refused_before_anything_is_computed(capture, tmp_path, capsys, part):
     (tmp_path / "one.txt").write_text("0 0 0 0 0 0 0 1\n7 0 0 0 0 0 0 1\n")
-    assert upsample(capture, "--only", f"depth,open3d,{part}", *more, "-o", tmp_path / "out") == 2
-    [error] = capsys.readouterr().err.splitlines()
-    missing = "1 of 2, such as 001" if "--poses" in more else "2 of 2, such as 000"
-    assert error.startswith(f"error: {part}: expected a pose of each frame, got none for {missing}")
-    assert "--poses" in error
+    for more, missing in (((), "2 of 2, such as 000"), (("--poses", tmp_path / "one.txt"), "1 of 2, such as 001")):
+        code = upsample(capture, "--only", f"depth,open3d,{part}", *more, "-o", tmp_path / "out")
+        line = refused_line(capsys, code)
+        assert line.startswith(f"{part}: expected a pose of each frame, got none for {missing}")
     assert not (tmp_path / "out").exists()
 
 
@@ -86,24 +63,22 @@ def test_foreign_file_in_place_of_an_export_is_left_alone(capture, tmp_path, cap
     out = tmp_path / "out"
     out.mkdir()
     (out / "open3d").write_text("mine")
-    assert upsample(capture, "--only", "open3d", "-o", out) == 2
-    assert "open3d: is there already and not of an earlier run" in capsys.readouterr().err
+    code = upsample(capture, "--only", "open3d", "-o", out)
+    assert "open3d: is there already and not of an earlier run" in refused_line(capsys, code)
     assert (out / "open3d").read_text() == "mine"
 
 
 def test_mesh_and_cloud_beyond_limits_are_said_and_recorded(capture, tmp_path, capsys):
     pytest.importorskip("fast_simplification", reason="pip install -e '.[mesh]'")
     out = tmp_path / "out"
-    limits = ("--keep", "all", "--max-faces", 500, "--max-points", 1000)
+    limits = ("--keep", "all", "--max-faces", 500, "--max-points", 500)
     assert upsample(capture, "--only", "depth,mesh,cloud", *limits, "-o", out) == 0
     said = capsys.readouterr().out
     entries = json.loads((out / "000" / "info.json").read_text())
     faces = trimesh.load(out / "000" / "mesh.glb", process=False, force="mesh").faces
     points = trimesh.load(out / "000" / "cloud.ply").vertices
-    assert entries["mesh"] == {"before": 2 * 47 * 63, "after": len(faces), "how": "quadric decimation"}
-    assert entries["cloud"]["before"] == 48 * 64
-    assert entries["cloud"]["after"] == len(points) <= 1000
-    assert (
-        f"the mesh has fewer triangles than the depth map gives (--max-faces) ({len(faces)} of 5922, by quadric" in said
-    )
+    assert entries["mesh"] == {"before": 2 * 23 * 31, "after": len(faces), "how": "quadric decimation"}
+    assert entries["cloud"]["before"] == 24 * 32
+    assert entries["cloud"]["after"] == len(points) <= 500
+    assert "the mesh has fewer triangles than the depth map gives (--max-faces)" in said
     assert "the cloud has fewer points than the depth map gives (--max-points)" in said

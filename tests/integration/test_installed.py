@@ -64,6 +64,7 @@ def test_installed_eval_writes_scores(dsr, tmp_path):
     assert (tmp_path / "out" / "scores.csv").is_file()
 
 
+@pytest.mark.nightly
 def test_installed_train_writes_weights(dsr, tmp_path):
     dsr("train", "trainer=smoke", "dataset.size=64", "dataset.count=6", "output_dir=out", *SMALL)
     assert (tmp_path / "out" / "weights.safetensors").is_file()

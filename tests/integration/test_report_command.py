@@ -2,13 +2,12 @@
 
 import json
 import re
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from commands import run_python
+from upsampling import refused_line
 
 from dsr.app import report
 from dsr.cli import main
@@ -17,67 +16,55 @@ SCENES = ("cube_high_freq", "statue")
 
 
 @pytest.fixture
-def runs(make_run: Callable[..., Path], tmp_path: Path) -> Path:
+def runs(make_run, tmp_path):
     """Two methods on two scenes."""
     for label in ("Bicubic", "MSG-V"):
         make_run(tmp_path / "runs" / label, label=label, method=label.lower(), scenes=SCENES)
     return tmp_path / "runs"
 
 
-def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+def refused(capsys, *arguments):
     """Return the one line of a command that is refused."""
-    assert main([str(argument) for argument in arguments]) == 2
-    [line] = capsys.readouterr().err.splitlines()
-    assert line.startswith("error: ")
-    return line.removeprefix("error: ")
+    return refused_line(capsys, main([*map(str, arguments)]))
 
 
-def test_report_has_tables_figures_the_metric_study_and_a_page(runs: Path, tmp_path: Path) -> None:
-    done = run_python("-m", "dsr", "report", str(runs), "-o", "report", "--title", "Ours", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    folder = tmp_path / "report"
+def test_report_of_workers_has_tables_figures_the_metric_study_and_a_page(runs, tmp_path):
+    for file in runs.rglob("scenes/statue.npz"):
+        file.write_bytes(b"damaged")
+    files, notes = [], []
+    for workers in ("1", "2"):
+        command = ("-m", "dsr", "report", str(runs), "-o", workers, "--workers", workers, "--title", "Ours")
+        done = run_python(*command, cwd=tmp_path)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert f"{workers}/index.html" in done.stdout
+        folder = tmp_path / workers
+        files.append({path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()})
+        notes.append([line for line in done.stdout.splitlines() if line.startswith("note:")])
+    assert files[0].keys() == files[1].keys()
+    assert [name for name, path in files[0].items() if path.read_bytes() != files[1][name].read_bytes()] == []
+    assert notes[0] == notes[1]
+    assert any("simgeo/statue x4 box: no pictures" in note for note in notes[0])
     for name in (
         *("tables/all.md", "tables/all.tex", "tables/simgeo_x4_box.csv", "figures/lights.pdf"),
         *("figures/renderings_simgeo_x4_box_1.pdf", "figures/errors_simgeo_x4_box_1.png"),
         *("metrics/pearson.csv", "metrics/scatter_matrix.pdf"),
     ):
-        assert (folder / name).stat().st_size > 100, name
-    page = (folder / "index.html").read_text(encoding="utf-8")
+        assert files[0][name].stat().st_size > 100, name
+    page = files[0]["index.html"].read_text(encoding="utf-8")
     assert "<title>Ours</title>" in page
     assert "tables/simgeo_x4_box.csv" in page
     assert "figures/lights.pdf" in page
-    assert "Bicubic" in (folder / "tables" / "all.md").read_text(encoding="utf-8")
-    assert json.loads((folder / "report.json").read_text())["runs"] == [str(runs / "Bicubic"), str(runs / "MSG-V")]
-    assert "report/index.html" in done.stdout
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["report", "runs"]
+    assert "Bicubic" in files[0]["tables/all.md"].read_text(encoding="utf-8")
+    about = json.loads(files[0]["report.json"].read_text())
+    assert about["runs"] == [str(runs / "Bicubic"), str(runs / "MSG-V")]
 
 
-def test_workers_make_the_same_files_and_notes_as_the_command_alone(runs: Path, tmp_path: Path) -> None:
-    for file in runs.rglob("scenes/statue.npz"):
-        file.write_bytes(b"damaged")
-    files, notes = [], []
-    command = ("-m", "dsr", "report", str(runs), "--only", "figures,page")
-    for workers in ("1", "2"):
-        done = run_python(*command, "-o", workers, "--workers", workers, cwd=tmp_path)
-        assert (done.returncode, done.stderr) == (0, "")
-        folder = tmp_path / workers
-        files.append({path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()})
-        notes.append([line for line in done.stdout.splitlines() if line.startswith("note:")])
-    assert Path("figures/renderings_simgeo_x4_box_1.pdf") in files[0]
-    assert files[0].keys() == files[1].keys()
-    assert [name for name, content in files[0].items() if content != files[1][name]] == []
-    assert notes[0] == notes[1]
-    assert any("simgeo/statue x4 box: no pictures" in note for note in notes[0])
-
-
-def test_interrupted_report_leaves_the_earlier_one_as_it_was(
-    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupted_report_leaves_the_earlier_one_as_it_was(runs, tmp_path, monkeypatch):
     output = tmp_path / "report"
     assert main(["report", str(runs), "-o", str(output), "--only", "tables"]) == 0
     before = {path: path.read_bytes() for path in output.rglob("*") if path.is_file()}
 
-    def interrupt(*_: object) -> None:
+    def interrupt(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(report, "write_correlations", interrupt)
@@ -86,16 +73,14 @@ def test_interrupted_report_leaves_the_earlier_one_as_it_was(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report", "runs"]
 
 
-def test_directory_with_foreign_files_is_refused_and_kept(
-    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_directory_with_foreign_files_is_refused_and_kept(runs, tmp_path, capsys):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("years of work")
     assert "it holds something else" in refused(capsys, "report", runs, "-o", tmp_path / "mine")
     assert (tmp_path / "mine" / "thesis.tex").read_text() == "years of work"
 
 
-def test_user_study_joins_the_tables(runs: Path, tmp_path: Path) -> None:
+def test_user_study_joins_the_tables(runs, tmp_path):
     shares, table = {"user_first": 75.0, "user_second": 25.0, "user_top2": 100.0}, tmp_path / "study.csv"
     ends = {f"{name}_{end}": value for name in shares for end, value in (("low", 40.0), ("high", 99.0))}
     row = {"dataset": "simgeo", "scene": "statue", "scale": 4, "downsampling": "box", "method": "msg-v"}
@@ -106,9 +91,7 @@ def test_user_study_joins_the_tables(runs: Path, tmp_path: Path) -> None:
     assert "75" in text
 
 
-def test_report_without_truth_has_pictures_and_no_tables(
-    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_report_without_truth_has_pictures_and_no_tables(runs, tmp_path, capsys):
     for folder in runs.iterdir():
         header = (folder / "scores.csv").read_text().splitlines()[0]
         (folder / "scores.csv").write_text(header + "\n")
@@ -125,43 +108,30 @@ def test_report_without_truth_has_pictures_and_no_tables(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--methods", "DIP"], "methods: expected some of Bicubic, MSG-V, got DIP"),
-        (["--scale", "8"], "scales: expected some of 4, got 8"),
-        (["--only", "tables,graphs"], "--only: expected some of tables, metrics, figures, page, got 'graphs'"),
-        (["--light", "e5"], "--light: expected one of e1, e2, e3, e4, got 'e5'"),
-        (["--page-px", "0"], "--page-px: expected at least 16, got 0"),
+        (["--methods", "DIP"], "methods: expected some of"),
+        (["--scale", "8"], "scales: expected some of"),
+        (["--only", "tables,graphs"], "--only: expected some of"),
         (["--study", "absent.csv"], "absent.csv: "),
     ],
 )
-def test_invalid_choice_is_one_line_and_nothing_is_written(
-    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
-) -> None:
+def test_invalid_choice_is_one_line_and_nothing_is_written(runs, tmp_path, capsys, arguments, message):
     assert refused(capsys, "report", runs, "-o", tmp_path / "report", *arguments).startswith(message)
     assert not (tmp_path / "report").exists()
 
 
-# truths of the same scenes that differ
-
-
 @pytest.fixture
-def apart(make_run: Callable[..., Path], tmp_path: Path) -> Path:
-    """Two methods on two scenes, with one truth each and with other ones of the same names."""
+def apart(make_run, tmp_path):
+    """Two methods on two scenes, with one ground truth each and with other ones of the same names."""
     for label in ("Bicubic", "MSG-V"):
         for place in ("one", "two"):
             make_run(tmp_path / "runs" / place / label, label=label, method=label.lower(), scenes=SCENES)
-        set_truths(tmp_path / "runs" / "two" / label, dict.fromkeys(SCENES, "5f3c01ab"))
+        path = tmp_path / "runs" / "two" / label / "summary.json"
+        truths = dict.fromkeys(SCENES, "5f3c01ab")
+        path.write_text(json.dumps({**json.loads(path.read_text()), "truths": truths}))
     return tmp_path / "runs"
 
 
-def set_truths(run: Path, truths: dict[str, str]) -> None:
-    """Change what identifies the ground truths of a run."""
-    path = run / "summary.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "truths": truths}))
-
-
-def test_different_truths_are_reported_and_have_tables_of_their_own(
-    apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_different_truths_are_reported_have_tables_of_their_own_and_strict_refuses_them(apart, tmp_path, capsys):
     assert main(["report", str(apart), "-o", str(tmp_path / "report"), "--only", "tables,page"]) == 0
     reported = " ".join(capsys.readouterr().out.split())
     assert reported.count("warning: simgeo x4: the runs have different ground truths") == 1
@@ -180,25 +150,18 @@ def test_different_truths_are_reported_and_have_tables_of_their_own(
     text = (report / "tables" / "all.md").read_text(encoding="utf-8")
     assert text.count("the runs have different ground truths") == 3
     assert "the runs have different ground truths" in (report / "index.html").read_text(encoding="utf-8")
-
-
-def test_strict_refuses_different_truths_unless_one_alone_is_chosen(
-    apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = ("report", apart, "-o", tmp_path / "report", "--only", "tables", "--strict")
-    line = refused(capsys, *command)
+    strict = ("report", apart, "-o", tmp_path / "strict", "--only", "tables", "--strict")
+    line = refused(capsys, *strict)
     assert "different ground truths" in line
-    assert not (tmp_path / "report").exists()
+    assert not (tmp_path / "strict").exists()
     name = re.findall(r"simgeo \(truth [0-9a-f]{8}\)", line)[0]
-    assert main([*map(str, command), "--datasets", name]) == 0
+    assert main([*map(str, strict), "--datasets", name]) == 0
 
 
-def test_leaderboard_is_a_page_that_ranks_the_methods_and_their_tables(
-    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_leaderboard_is_a_page_that_ranks_the_methods_and_their_tables(runs, tmp_path, capsys):
     assert main(["leaderboard", str(runs), "-o", str(tmp_path / "site"), "--title", "Ours"]) == 0
     page = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
-    standings = json.loads(re.search(r'"standings":(\[.*?\]),"scenes"', page)[1])  # type: ignore[index]
+    standings = json.loads(re.search(r'"standings":(\[.*?\]),"scenes"', page)[1])
     assert {row["method"] for row in standings} == {"Bicubic", "MSG-V"}
     assert {row["settings"] for row in standings} == {1}
     assert [row["rank"] for row in standings] == sorted(row["rank"] for row in standings)

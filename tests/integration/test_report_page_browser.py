@@ -18,49 +18,23 @@ from dsr.report.worker_pool import WorkerPool
 
 SPITEFUL = "<img src=x onerror=alert(1)>\"'&</script><script>alert(2)</script>"
 SIZE = 64
-DESKTOP = {"width": 1280, "height": 900}
 SCENES = ("cube_no_texture", "statue")
-
-
-@pytest.fixture(scope="module")
-def window(browser):
-    """A page in a window with mouse and touch, and what it said or asked for that it should not have."""
-    context = browser.new_context(viewport=DESKTOP, has_touch=True, reduced_motion="reduce")
-    page, wrong = context.new_page(), []
-    page.on("console", lambda message: wrong.append(message.text))
-    page.on("pageerror", lambda error: wrong.append(str(error)))
-    page.on("dialog", lambda dialog: (wrong.append(dialog.message), dialog.dismiss()))
-    page.on("request", lambda request: None if harmless(request.url) else wrong.append(request.url))
-    yield page, wrong
-    context.close()
 
 
 @pytest.fixture
 def opened(window):
-    """Return what opens the page anew; errors and requests that it makes fail the test at its end."""
-    page, wrong = window
-    wrong.clear()
+    """Return what opens a page whose stage is drawn."""
+    shown = window(has_touch=True, reduced_motion="reduce")
 
     def open_page(url):
-        page.set_viewport_size(DESKTOP)
-        page.goto("about:blank")
-        page.goto(url)
-        page.wait_for_selector(".stage[data-shown]")
-        page.evaluate("document.querySelector('#scenes').scrollIntoView()")
-        settle(page)
-        return page
+        shown.page.goto("about:blank")
+        shown.page.goto(url)
+        shown.page.wait_for_selector(".stage[data-shown]")
+        shown.page.evaluate("document.querySelector('#scenes').scrollIntoView()")
+        shown.settle()
+        return shown
 
-    yield open_page
-    assert wrong == []
-
-
-def harmless(url):
-    return url.startswith(("data:", "blob:", "about:")) or (url.startswith("file:") and ".html" in url)
-
-
-def settle(page):
-    """Wait until what was asked for is drawn."""
-    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    return open_page
 
 
 def pixels(page, selector):
@@ -88,9 +62,9 @@ def rendering(results, label, light):
     return 255 * render(normals(results, label))[0, light].numpy()
 
 
-def choose(page, side, label):
-    page.locator(f"#scenes select.{side}").select_option(label=label)
-    settle(page)
+def choose(shown, side, label):
+    shown.page.locator(f"#scenes select.{side}").select_option(label=label)
+    shown.settle()
 
 
 def test_reader_lights_compares_reads_out_sorts_and_follows_a_link(opened, make_run, tmp_path):
@@ -100,12 +74,13 @@ def test_reader_lights_compares_reads_out_sorts_and_follows_a_link(opened, make_
     make_run(tmp_path / "x8", scale=8, scenes=SCENES[:1], size=SIZE)
     results = load_results([tmp_path])
     save_page(tmp_path / "index.html", Pictures(WorkerPool(results)), title="A report")
-    page = opened((tmp_path / "index.html").as_uri())
-    choose(page, "left", "MSG-V")
+    shown = opened((tmp_path / "index.html").as_uri())
+    page = shown.page
+    choose(shown, "left", "MSG-V")
     page.locator(".stage").focus()
     for light in (1, 0, 3, 2):
         page.keyboard.press(str(light + 1)) if light % 2 else page.click(f"[data-light=e{light + 1}]")
-        settle(page)
+        shown.settle()
         for side, label in (("left", "MSG-V"), ("right", "truth")):
             drawn = pixels(page, f".pane-{side} canvas").astype(float)
             assert drawn.shape == (SIZE, SIZE, 3)
@@ -143,25 +118,19 @@ def test_reader_lights_compares_reads_out_sorts_and_follows_a_link(opened, make_
     page.evaluate("document.querySelectorAll('#tables details').forEach((each) => { each.open = true; })")
     page.locator("#tables .go:has-text('statue')").last.click()
     page.wait_for_selector(".stage[data-shown=s1]")
-    again = opened(page.url)
+    again = opened(page.url).page
     again.wait_for_selector(".stage[data-shown=s1]")
     assert again.inner_text(".name-left") == "MSG-V"
 
 
-@pytest.fixture
-def sure(make_run, tmp_path):
-    """Return a run with expected errors, one without, and the address of the page about them."""
+def test_expected_errors_have_the_colours_and_limits_of_the_measured_ones(opened, make_run, tmp_path):
     make_run(tmp_path / "plain", size=SIZE)
     make_run(tmp_path / "sure", method="sure", label="Sure", size=SIZE, confident=True)
-    runs = load_results([tmp_path])
-    save_page(tmp_path / "index.html", Pictures(WorkerPool(runs)))
-    return runs, (tmp_path / "index.html").as_uri()
-
-
-def test_expected_errors_have_the_colours_and_limits_of_the_measured_ones(opened, sure):
-    results, address = sure
-    page = opened(address)
-    choose(page, "left", "Sure")
+    results = load_results([tmp_path])
+    save_page(tmp_path / "index.html", Pictures(WorkerPool(results)))
+    shown = opened((tmp_path / "index.html").as_uri())
+    page = shown.page
+    choose(shown, "left", "Sure")
     run = run_of(results, "Sure")
     errors = [each[0].double().numpy() for each in run.expected_errors(SCENES[0])]
     measured = [np.abs((each.prediction(SCENES[0]) - each.sample(SCENES[0]).depth).numpy()) for each in results.runs]
@@ -169,7 +138,7 @@ def test_expected_errors_have_the_colours_and_limits_of_the_measured_ones(opened
     scaled = {"expectedError": (errors[0] / limit + 1) / 2, "expectedAngle": errors[1] / 60}
     for view, colours in (("expectedError", "RdBu_r"), ("expectedAngle", "magma")):
         page.click(f"[data-view={view}]")
-        settle(page)
+        shown.settle()
         expected = 255 * mpl.colormaps[colours](scaled[view])[..., :3]
         assert np.abs(pixels(page, ".pane-left canvas") - expected).max() <= 6
         truth = pixels(page, ".pane-right canvas")
@@ -198,7 +167,7 @@ def test_names_in_the_files_of_a_run_are_shown_and_not_run(opened, make_run, tmp
     results = load_results([folder])
     write_tables(tmp_path / "tables", results)
     save_page(tmp_path / "index.html", Pictures(WorkerPool(results)))
-    page = opened((tmp_path / "index.html").as_uri())
+    page = opened((tmp_path / "index.html").as_uri()).page
     assert SPITEFUL in page.inner_text("#tables")
     assert name in page.inner_text("body")
     assert page.locator("img").count() == 0

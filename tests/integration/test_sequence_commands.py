@@ -77,9 +77,9 @@ def rig(tmp_path):
     return tmp_path
 
 
-def with_rig(folder, *more, extrinsics="move.txt"):
+def with_rig(folder, *more):
     files = ("--rgb", folder / "photo.png", "--depth", folder / "depth.npy", "--camera", folder / "photo.json")
-    rig = ("--depth-camera", folder / "ir.json", "--extrinsics", folder / extrinsics)
+    rig = ("--depth-camera", folder / "ir.json", "--extrinsics", folder / "move.txt")
     return upsample(*files, *rig, *DEPTH_ONLY, "-o", folder / "out", *more)
 
 
@@ -97,9 +97,6 @@ def test_rig_gives_depth_in_the_photos_view(rig, capsys):
     ("matrix", "message"),
     [
         (1.1 * np.eye(4)[:3], "move.txt: expected a rigid transform"),
-        (np.full((3, 4), np.nan), "move.txt: expected finite numbers"),
-        (np.eye(3), "move.txt: expected a matrix of 3 x 4 or 4 x 4 numbers"),
-        (pose(-90.0), "move.txt: expected a translation in metres"),
         (pose(-9.0), "--extrinsics: expected the transform from the depth camera's frame"),
     ],
 )
@@ -121,9 +118,8 @@ def apart(tmp_path):
         top, left, height, width = rng.integers((0, 0, 20, 20), (200, 280, 60, 60))
         depth[top : top + height, left : left + width] = near
         photo[top : top + height, left : left + width] = rng.integers(30, 220, 3)
-    Image.fromarray((photo + 3 * rng.standard_normal(photo.shape)).clip(0, 255).astype(np.uint8)).save(
-        tmp_path / "photo.png"
-    )
+    photo = (photo + 3 * rng.standard_normal(photo.shape)).clip(0, 255).astype(np.uint8)
+    Image.fromarray(photo).save(tmp_path / "photo.png")
     np.save(tmp_path / "depth.npy", np.roll(depth, (4, -6), (0, 1)))
     return tmp_path, depth
 
@@ -133,20 +129,18 @@ def test_displaced_pair_is_warned_of_and_register_cures_it(apart, capsys):
     files = ("--rgb", folder / "photo.png", "--depth", folder / "depth.npy", "--fov", "60", *DEPTH_ONLY)
     files = (*files, "--fill", "none", "--method", "bilateral")
     assert upsample(*files, "-o", folder / "out") == 0
-    out = " ".join(capsys.readouterr().out.split())
-    assert "the photo's edges lie beside the depth edges (6.0 px to the right, 4.0 px above" in out
-    assert "--register" in out
+    warning = "the photo's edges lie beside the depth edges (6.0 px to the right, 4.0 px above"
+    assert warning in capsys.readouterr().out
     assert upsample(*files, "--register", "-o", folder / "cured") == 0
-    assert "the depth map is moved to the photo's edges (by 6.0 px to the right, 4.0 px up)" in " ".join(
-        capsys.readouterr().out.split()
-    )
+    cured = "the depth map is moved to the photo's edges (by 6.0 px to the right, 4.0 px up)"
+    assert cured in capsys.readouterr().out
     result = np.load(folder / "cured" / "depth.npy")
     inner = (slice(8, -8), slice(8, -8))
     assert (np.abs(result - depth)[inner] < 0.05).mean() > 0.97
     assert info(folder / "cured")["settings"]["register"] is True
     np.save(folder / "depth.npy", depth)  # which is beside nothing
     assert upsample(*files, "--register", "-o", folder / "same") == 0
-    assert "no displacement is certain, the depth map stays where it is" in " ".join(capsys.readouterr().out.split())
+    assert "no displacement is certain, the depth map stays where it is" in capsys.readouterr().out
     assert upsample(*files, "-o", folder / "plain") == 0
     assert "warning" not in capsys.readouterr().out
     assert np.array_equal(np.load(folder / "same" / "depth.npy"), np.load(folder / "plain" / "depth.npy"))
@@ -172,34 +166,29 @@ def test_neighbours_lower_the_noise_and_keep_the_pose(capture, capsys):
     assert {"poses", "neighbour_1_depth", "neighbour_4_depth"} <= about["inputs"].keys()
 
 
-def test_same_command_again_is_complete_and_a_changed_neighbour_is_not(capture, capsys):
-    command = (capture, "--poses", capture.parent / "poses.txt", "--neighbours", "2", *DEPTH_ONLY)
-    command = (*command, "-o", capture.parent / "out")
-    assert upsample(*command) == 0
+def test_broken_neighbour_does_not_stop_the_others_and_a_changed_one_is_noticed(capture, capsys):
+    broken, whole = capture.parent / "broken", capture.parent / "whole"
+    command = (capture, "--poses", capture.parent / "poses.txt", "--neighbours", "2", *DEPTH_ONLY, "-o")
+    content = (capture / "depth" / "003.png").read_bytes()
+    (capture / "depth" / "003.png").write_bytes(b"\x89PNG broken")
+    assert "003" in refused_line(capsys, upsample(*command, broken))
+    assert sorted(path.parent.name for path in broken.glob("*/depth.png")) == ["000", "001", "002", "004"]
+    (capture / "depth" / "003.png").write_bytes(content)
+    assert upsample(*command, whole) == 0
     capsys.readouterr()
-    assert upsample(*command) == 0
+    assert upsample(*command, whole) == 0
     assert "5 complete already" in capsys.readouterr().out
     depth = cv2.imread(str(capture / "depth" / "000.png"), cv2.IMREAD_UNCHANGED)
     cv2.imwrite(str(capture / "depth" / "000.png"), depth + 1)
-    assert upsample(*command) == 2
+    assert upsample(*command, whole) == 2
     outcome = capsys.readouterr()
     assert all(f"{name}: holds a result of other inputs" in outcome.err for name in ("000", "001"))
     assert "3 complete already" in outcome.out  # the others do not depend on frame 000
 
 
-def test_broken_neighbour_does_not_stop_the_others(capture, capsys):
-    (capture / "depth" / "003.png").write_bytes(b"\x89PNG broken")
-    options = ("--poses", capture.parent / "poses.txt", "--neighbours", "2", *DEPTH_ONLY)
-    assert "003" in refused_line(capsys, upsample(capture, *options, "-o", capture.parent / "out"))
-    done = sorted(path.parent.name for path in (capture.parent / "out").glob("*/depth.png"))
-    assert done == ["000", "001", "002", "004"]
-
-
 def test_neighbours_without_poses_are_refused(capture, capsys):
     code = upsample(capture, "--neighbours", "2", *DEPTH_ONLY, "-o", capture.parent / "out")
-    assert "expected a pose for each frame, this capture has none; give --poses" in refused_line(capsys, code)
-    code = upsample(capture, "--neighbours", "-1", "-o", capture.parent / "out")
-    assert "--neighbours: expected 0 or a positive number of frames, got -1" in refused_line(capsys, code)
+    assert "expected a pose for each frame" in refused_line(capsys, code)
 
 
 # fuse
@@ -253,17 +242,12 @@ def test_results_without_poses_and_damaged_ones_are_refused(capture, capsys):
     assert upsample(capture, *DEPTH_ONLY, "-o", out) == 0
     capsys.readouterr()
     assert "expected a pose; run" in refused_line(capsys, main(["fuse", str(out), "-o", str(mesh)]))
-    for number, change in enumerate(({"pose": np.ones((4, 4)).tolist()}, {"camera": 3}, {"complete": False})):
+    for number, change in enumerate(({"pose": np.ones((4, 4)).tolist()}, {"camera": 3}, {"complete": False}, {}, {})):
         path = out / f"{number:03}" / "info.json"
         path.write_text(json.dumps({**json.loads(path.read_text()), "pose": pose(0.0).tolist(), **change}))
     (out / "003" / "depth_metres.tiff").write_bytes(b"broken")
-    path = out / "003" / "info.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "pose": pose(0.0).tolist()}))
-    path = out / "004" / "info.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "pose": pose(0.0).tolist()}))
     assert main(["fuse", str(out), "-o", str(mesh)]) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 4
+    assert len(capsys.readouterr().err.splitlines()) == 4
     assert mesh.is_file()
     assert ".ply" in refused_line(capsys, main(["fuse", str(out), "-o", str(capture.parent / "mesh.obj")]))
     assert "found no info.json" in refused_line(capsys, main(["fuse", str(capture), "-o", str(mesh)]))
@@ -288,21 +272,10 @@ def poses_of(folder, change, count=6):
     return ("--poses", path)
 
 
-def in_millimetres(matrix):
-    changed = matrix.copy()
-    changed[:3, 3] *= 1000
-    return changed
-
-
-@pytest.mark.parametrize(
-    ("change", "name"), [(np.linalg.inv, "from world to camera"), (in_millimetres, "in millimetres")]
-)
-def test_poses_that_are_read_wrongly_are_reported_once_and_in_every_info(walked, capsys, change, name):
+def test_poses_that_are_read_wrongly_are_reported_once_and_in_every_info(walked, capsys):
     out = walked.parent / "out"
-    assert upsample(walked, *poses_of(walked, change), *DEPTH_ONLY, "-o", out) == 0
-    reported = " ".join(capsys.readouterr().out.split())
-    assert reported.count("warning: the poses are probably") == 1
-    assert re.search(rf"the poses are probably {name} \(as given, .* \d+% .* \d+%\)", reported)
+    assert upsample(walked, *poses_of(walked, np.linalg.inv), *DEPTH_ONLY, "-o", out) == 0
+    assert capsys.readouterr().out.count("warning: the poses are probably from world to camera") == 1
     for number in range(6):
         (warning,) = info(out / f"{number:03}")["warnings"]
         assert warning["code"] == "poses"
@@ -318,23 +291,19 @@ def test_frames_without_a_pose_are_reported_and_strict_refuses_them(walked, caps
     command = (walked, "--poses", walked.parent / "poses.txt", *DEPTH_ONLY)
     write(0, 1, 2, 3)
     assert upsample(*command, "-o", walked.parent / "fewer") == 0
-    reported = " ".join(capsys.readouterr().out.split())
-    assert "poses.txt: 4 poses for 6 frames" in reported
-    assert reported.count("warning: poses.txt has no pose of this frame (2 of 6 frames have none)") == 1
-    found = {number: [each["code"] for each in info(walked.parent / "fewer" / f"{number:03}")["warnings"]]
-             for number in range(6)}  # fmt: skip
-    assert found == {0: [], 1: [], 2: [], 3: [], 4: ["poses-missing"], 5: ["poses-missing"]}
+    assert capsys.readouterr().out.count("warning: poses.txt has no pose of this frame (2 of 6 frames have none)") == 1
+    found = [info(walked.parent / "fewer" / f"{number:03}")["warnings"] for number in range(6)]
+    assert [[each["code"] for each in warnings] for warnings in found] == [[]] * 4 + [["poses-missing"]] * 2
     assert upsample(*command, "--strict", "-o", walked.parent / "strict") == 2
-    assert "4 done, 2 failed" in " ".join(capsys.readouterr().out.split())
+    assert "4 done, 2 failed" in capsys.readouterr().out
     write(*range(8))
-    assert upsample(*command, "-o", walked.parent / "more") == 0
+    assert upsample(*command, "--dry-run", "-o", walked.parent / "more") == 0
     reported = capsys.readouterr().out
-    assert "8 poses for 6 frames" in " ".join(reported.split())
+    assert "8 poses for 6 frames" in reported
     assert "warning" not in reported
     write(100, 101)
-    assert "expected a pose for each of the 6 frames" in refused_line(
-        capsys, upsample(*command, "-o", walked.parent / "x")
-    )
+    code = upsample(*command, "-o", walked.parent / "none")
+    assert "expected a pose for each of the 6 frames" in refused_line(capsys, code)
 
 
 def test_fuse_reports_wrong_poses_and_strict_refuses_them(walked, capsys):

@@ -33,26 +33,20 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
-def environment(dsr_cache):
-    kept = {key: value for key, value in os.environ.items() if key not in ("DSR_LPIPS_TRUNK", "HYDRA_FULL_ERROR")}
-    return {**kept, "DSR_CACHE": str(dsr_cache), "OMP_NUM_THREADS": "1"}
-
-
-@pytest.fixture(scope="module")
-def smoke(tmp_path_factory, environment):
+def smoke(tmp_path_factory):
     """The working directory, the run's directory and the finished process of a smoke training."""
     folder = tmp_path_factory.mktemp("smoke")
-    done = run_python(TRAIN, *SMOKE, cwd=folder, env=environment)
+    done = run_python(TRAIN, *SMOKE, cwd=folder)
     assert done.returncode == 0, done.stderr
     [home] = (folder / "outputs" / "train").iterdir()
     return folder, home, done
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory, environment):
+def whole(tmp_path_factory):
     """The directory of a training of four steps that was not interrupted."""
     folder = tmp_path_factory.mktemp("whole")
-    done = run_python(TRAIN, *FOUR, "output_dir=whole", cwd=folder, env=environment)
+    done = run_python(TRAIN, *FOUR, "output_dir=whole", cwd=folder)
     assert done.returncode == 0, done.stderr
     return folder / "whole"
 
@@ -157,16 +151,12 @@ def test_log_has_losses_scores_rates_renderings_and_the_configuration(smoke):
     assert "validation_scenes: 1" in text.tensor_proto.string_val[0].decode()
     shown = events.summary_metadata["_hparams_/experiment"].plugin_data.content
     assert [each.name for each in HParamsPluginData.FromString(shown).experiment.hparam_infos] == list(COLUMNS)
+    w = float(smoke[2].stdout.split("lap1 + ")[-1].split()[0])
+    loss, depth, visual = (scalars_of(home, f"train/{name}") for name in ("loss", "lap1", "mse_v"))
+    assert loss == pytest.approx({step: depth[step] + w * visual[step] for step in loss}, rel=2e-3)
     validations = scalars_of(home, "val/RMSE_v")
     best = min(validations, key=validations.get)
     assert scalars_of(home, "score/RMSE_v")[best] == validations[best]
-
-
-def test_training_loss_is_the_sum_of_its_terms(smoke):
-    loss, depth, visual = (scalars_of(smoke[1], f"train/{name}") for name in ("loss", "lap1", "mse_v"))
-    w = float(smoke[2].stdout.split("lap1 + ")[-1].split()[0])
-    for step, value in loss.items():
-        assert value == pytest.approx(depth[step] + w * visual[step], rel=2e-3)
 
 
 def test_directory_of_a_training_is_kept_unless_overwrite_is_set(smoke, tmp_path, within):
@@ -188,9 +178,8 @@ def test_directory_of_a_training_is_kept_unless_overwrite_is_set(smoke, tmp_path
     assert same_weights(tmp_path / "out", smoke[1])
 
 
-@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-def test_msg_is_trained_on_depth_alone_and_validates_after_its_last_step(tmp_path, within, precision):
-    given = (f"precision={precision}", "model=msg", "scale=2", "trainer.max_steps=3", "trainer.val_check_interval=2")
+def test_msg_is_trained_on_depth_alone_and_validates_after_its_last_step(tmp_path, within):
+    given = ("precision=bfloat16", "model=msg", "scale=2", "trainer.max_steps=3", "trainer.val_check_interval=2")
     code, output, errors = within(*SMOKE, *given, "output_dir=out")
     assert (code, errors, validated(output)) == (0, [], [0, 2, 3])
     assert "loss   mse" in output.splitlines()
@@ -208,26 +197,16 @@ def test_diverged_training_writes_no_weights_of_it(tmp_path, within):
 
 USAGE_ERRORS = {
     "a weight that is none": (["loss.w=abc"], "loss.w: "),
-    "a mistyped loss": (["model.objective.depth_loss=l3"], "model.objective.depth_loss: "),
-    "a patch the scale does not divide": (["patches.patch=30"], "patches.patch: "),
     "no step": (["trainer.max_steps=0"], "trainer.max_steps: "),
     "a learning rate of nan": (["model.optimizer.lr=nan"], "model.optimizer: "),
     "an argument of the trainer that dsr sets": (["+trainer.num_nodes=2"], "trainer.num_nodes: "),
     "a trainer that Lightning refuses": (["+trainer.gradient_clip_algorithm=foo"], "trainer: "),
-    "an unknown argument of the trainer": (["+trainer.tpu_cores=3"], "trainer.tpu_cores: "),
-    "a visual loss of a model without": (["model=msg", "loss.visual=dssim"], "loss.visual: model=msg has "),
     "a visual loss without its network": (["loss.visual=lpips", "metrics.lpips_trunk=none.pth"], "loss.visual: lpips "),
     "too few scenes": (["dataset.count=1"], "patches.validation_scenes: "),
     "a patch larger than a scene": (["patches.patch=128"], "patches.patch: expected at most 00000's 64 x 64, got 128"),
     "a data set to evaluate on": (["dataset=simgeo", "~dataset.count"], "dataset=simgeo: its scenes are to evaluate"),
-    "a measured map": (["downsampling=measured"], "downsampling: "),
     "weights that are not there": (["start.weights=nowhere"], "start.weights: nowhere: no such weights file"),
     "parameters that are not there": (["start.frozen=[wide.*]"], "start.frozen: "),
-    "factors that do not fit": (
-        ["model=facets", "degradation=everything", "degradation.scales={4: 1, 8: 1}"],
-        "degradation.scales: ",
-    ),
-    "a foreign directory": (["output_dir=foreign"], "output_dir: foreign holds files of something else"),
     "a directory that is none to resume": (["resume=foreign"], "resume: continues with the run's own configuration"),
 }
 
@@ -239,24 +218,28 @@ def test_usage_error_is_one_line_with_exit_code_2_and_writes_nothing(tmp_path, w
     (tmp_path / "foreign" / "thesis.txt").write_text("precious")
     given = [each for each in SMOKE if not (case == "a data set to evaluate on" and each.startswith("dataset"))]
     code, _, errors = within(*given, *[each for each in arguments if not each.startswith("~")])
-    assert code == 2
-    assert len(errors) == 1, errors
+    assert (code, len(errors)) == (2, 1), errors
     assert errors[0].startswith(f"error: {start}")
+    assert [path.name for path in tmp_path.iterdir()] == ["foreign"]
     assert tree(tmp_path) == ["foreign/thesis.txt"]
-    assert not (tmp_path / "outputs").exists()
 
 
-@pytest.mark.parametrize("name", ["wandb", "mlflow"])
-def test_logger_that_is_not_installed_is_named_before_anything_is_written(tmp_path, within, name):
-    if importlib.util.find_spec(name) is not None:
-        pytest.skip(f"{name} is installed")
-    code, output, [line] = within(*SMOKE, f"logger={name}")
+@pytest.mark.skipif(importlib.util.find_spec("mlflow") is not None, reason="mlflow is installed")
+def test_logger_that_is_not_installed_is_named_before_anything_is_written(tmp_path, within):
+    code, output, [line] = within(*SMOKE, "logger=mlflow")
     assert (code, output) == (2, "")
-    assert line.startswith(f"error: logger={name}: expected {name}, which is not installed")
+    assert line.startswith("error: logger=mlflow: expected mlflow, which is not installed")
     assert tree(tmp_path) == []
 
 
-@pytest.mark.parametrize(("step", "method"), [(0, "validation_step"), (2, "loss_terms"), (2, "validation_step")])
+@pytest.mark.parametrize(
+    ("step", "method"),
+    [
+        (2, "loss_terms"),
+        pytest.param(0, "validation_step", marks=pytest.mark.nightly),
+        pytest.param(2, "validation_step", marks=pytest.mark.nightly),
+    ],
+)
 def test_interrupted_training_gives_bit_identical_weights_and_logs(whole, tmp_path, within, stop, step, method):
     handler = signal.getsignal(signal.SIGINT)
     stop(step, method)
@@ -280,31 +263,18 @@ def test_interrupted_training_gives_bit_identical_weights_and_logs(whole, tmp_pa
     assert sorted(path.name for path in (tmp_path / "out" / "checkpoints").iterdir()) == ["best.ckpt", "last.ckpt"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_stopped_process_ends_at_a_step_and_a_killed_one_goes_on_from_its_checkpoint(
-    tmp_path, environment, within, number
-):
-    many = (*SMOKE, "trainer.max_steps=24", "trainer.val_check_interval=4", "output_dir=out")
-    if number != signal.SIGKILL:
-        many = (*many[:-1], "trainer.max_steps=500", "patches.workers=2", many[-1])
-    with Program(TRAIN, *many, cwd=tmp_path, env=environment) as process:
+@pytest.mark.nightly
+def test_killed_training_goes_on_from_its_checkpoint(tmp_path, within):
+    many = (*SMOKE, "trainer.max_steps=24", "trainer.val_check_interval=4")
+    with Program(TRAIN, *many, "output_dir=out", cwd=tmp_path) as process:
         deadline = time.monotonic() + 60
         while not (tmp_path / "out/checkpoints/last.ckpt").exists() and time.monotonic() < deadline:
             time.sleep(0.02)
-        process.send_signal(number)
-        _, errors = process.communicate(timeout=60)
+        process.send_signal(signal.SIGKILL)
     assert not (tmp_path / "out" / "weights.safetensors").exists()
-    if number != signal.SIGKILL:
-        assert process.returncode == 128 + number
-        step = last_step(tmp_path / "out")
-        assert 4 <= step < 500
-        assert errors.splitlines()[-1] == f"interrupted at step {step}; resume=out continues from there"
-        return
-    assert process.returncode == -signal.SIGKILL
     code, output, errors = within("resume=out")
-    assert (code, errors) == (0, [])
-    assert "resumed" in output
-    assert within(*many[:-1], "output_dir=whole")[0] == 0
+    assert (code, errors, "resumed" in output) == (0, [], True)
+    assert within(*many, "output_dir=whole")[0] == 0
     assert same_weights(tmp_path / "out", tmp_path / "whole")
     assert validations_of(tmp_path / "out") == validations_of(tmp_path / "whole")
 
@@ -365,7 +335,6 @@ REFUSED = {
     "files elsewhere": lambda checkpoint: state_of_best(checkpoint).update(
         best_k_models={f"{state_of_best(checkpoint)['dirpath']}/../../mine": torch.ones(())}
     ),
-    "no weights": lambda checkpoint: checkpoint.update(state_dict={}),
 }
 
 
@@ -386,8 +355,8 @@ def test_checkpoint_that_is_none_of_the_training_is_refused_in_one_line(smoke, t
     assert tree(tmp_path / "mine") == ["thesis.txt"]
 
 
-@pytest.mark.parametrize("name", ["tensorboard", "checkpoints/best.ckpt"])
-def test_link_out_of_the_run_is_refused_and_nothing_is_written(smoke, tmp_path, within, name):
+def test_link_out_of_the_run_is_refused_and_nothing_is_written(smoke, tmp_path, within):
+    name = "checkpoints/best.ckpt"
     shutil.copytree(smoke[1], tmp_path / "out")
     (tmp_path / "out" / "weights.safetensors").unlink()
     path = tmp_path / "out" / name
@@ -434,9 +403,9 @@ def test_mixtures_validate_with_each_part_and_evaluation_of_the_run_gives_the_sc
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["run=nowhere"], "nowhere: expected the directory of a training, it has no readable config.yaml"),
-        (["run={run}", "method=bicubic"], "method: run={run} sets it, too; leave one of them out"),
-        (["run={run}"], "run: {run} has no weights.safetensors; the training is not finished"),
+        (["run=nowhere"], "nowhere: expected the directory of a training"),
+        (["run={run}", "method=bicubic"], "method: run={run} sets it, too"),
+        (["run={run}"], "run: {run} has no weights.safetensors"),
     ],
 )
 def test_run_that_cannot_be_evaluated_is_refused(smoke, tmp_path, within, arguments, message):
@@ -444,8 +413,9 @@ def test_run_that_cannot_be_evaluated_is_refused(smoke, tmp_path, within, argume
     shutil.copytree(smoke[1], run)
     if len(arguments) == 1:
         (run / "weights.safetensors").unlink()
-    code, output, errors = within(*(each.format(run=run) for each in arguments), "metrics.lpips=false", name="eval")
-    assert (code, output, errors) == (2, "", [f"error: {message.format(run=run)}"])
+    code, output, [line] = within(*(each.format(run=run) for each in arguments), "metrics.lpips=false", name="eval")
+    assert (code, output) == (2, "")
+    assert line.startswith(f"error: {message.format(run=run)}")
 
 
 def test_network_that_fits_any_scale_starts_from_weights_of_another(smoke, tmp_path, within):
@@ -460,7 +430,6 @@ def test_network_that_fits_any_scale_starts_from_weights_of_another(smoke, tmp_p
     code, _, errors = within(*SMOKE, "scale=8", f"start.weights='{smoke[1]}/weights.safetensors'", "output_dir=other")
     assert code == 2
     assert f"start.weights: {smoke[1]}/weights.safetensors: " in errors[0]
-    assert errors[0].endswith("weights are for scale 4, the run is at scale 8, where MSGNet has other parameters")
 
 
 @pytest.mark.nightly
@@ -483,11 +452,12 @@ def test_facets_share_layers_with_weights_of_another_scale_and_some_are_frozen(t
 
 
 @pytest.mark.nightly
-def test_losses_and_scores_of_two_devices_are_those_of_one_with_the_same_patches(tmp_path, environment):
-    apart = {key: value for key, value in environment.items() if not key.startswith("SLURM_")}
+def test_losses_and_scores_of_two_devices_are_those_of_one_with_the_same_patches(tmp_path, monkeypatch):
+    for name in [name for name in os.environ if name.startswith("SLURM_")]:
+        monkeypatch.delenv(name)
     given = (*SMOKE, "precision=float32", "patches.validation_scenes=3", "trainer.val_check_interval=2")
     for name, more in (("one", ("patches.batch=4",)), ("two", ("trainer.devices=2", "trainer.strategy=ddp"))):
-        done = run_python(TRAIN, *given, *more, f"output_dir={name}", cwd=tmp_path, env=apart)
+        done = run_python(TRAIN, *given, *more, f"output_dir={name}", cwd=tmp_path)
         assert done.returncode == 0, done.stderr
     assert done.stdout.count("weights: ") == 1
     assert "steps  2 of 2 patches of 32 x 32 x 2 devices" in done.stdout

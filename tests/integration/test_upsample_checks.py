@@ -1,6 +1,5 @@
 """``dsr upsample`` of values and cameras that can't be what they are taken for: read, asked for, or warned of."""
 
-import json
 import shutil
 
 import cv2
@@ -8,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 from small_scenes import room
-from upsampling import refused_line
+from upsampling import info, refused_line
+from upsampling import upsample as run_upsample
 
-from dsr.cli import main
 from dsr.geometry.camera import Camera
 from dsr.io.depth_files import read_depth_file
 
@@ -36,14 +35,14 @@ def write(folder, values, size=(256, 192), name="depth"):
 
 
 def upsample(*arguments):
-    return main(["upsample", *map(str, arguments), "--method", "bicubic", "--only", "depth"])
+    return run_upsample(*arguments, "--method", "bicubic", "--only", "depth")
 
 
 def warned(tmp_path, capsys, files, *options):
     """Return the codes in info.json, and what was printed, after checking that --strict refuses what is warned of."""
     assert upsample(*files, *options, "-o", tmp_path / "out") == 0
     printed = capsys.readouterr().out
-    warnings = json.loads((tmp_path / "out" / "info.json").read_text())["warnings"]
+    warnings = info(tmp_path / "out")["warnings"]
     assert printed.count("warning: ") == len(warnings)
     shutil.rmtree(tmp_path / "strict", ignore_errors=True)
     code = upsample(*files, *options, "-o", tmp_path / "strict", "--strict")
@@ -65,29 +64,22 @@ def metres(folder):
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        (MILLIMETRES, "whole numbers are read as millimetres"),
         (MILLIMETRES * np.uint16(5), "whole numbers are read as 1/5000 m: values are multiples of 5"),
         ((MILLIMETRES << 3) | (MILLIMETRES >> 13), "values are multiples of 8: bits are turned back by 3"),
-        (DEPTH.astype(np.float32), "floats are read as metres"),
         (DEPTH.astype(np.float32) * 1000, "floats this large are read as millimetres"),
-        (MILLIMETRES.astype(np.float32), "floats this large are read as millimetres"),
     ],
 )
 def test_what_values_show_is_read_so_with_its_reason(tmp_path, capsys, values, said):
-    codes, printed = warned(tmp_path, capsys, write(tmp_path, values))
-    assert codes == []
-    assert said in printed
+    assert upsample(*write(tmp_path, values), "--strict", "-o", tmp_path / "out") == 0
+    assert said in capsys.readouterr().out
     assert np.median(metres(tmp_path / "out")) == pytest.approx(np.median(DEPTH), rel=0.01)
 
 
 def test_sizes_and_cameras_of_known_data_sets_give_the_unit(tmp_path, capsys):
     unrounded = np.round(cv2.resize(DEPTH, HD) * 5000).astype(np.uint16)
     intrinsics = ("--intrinsics", 481.2, 480, 319.5, 239.5)
-    _, printed = warned(tmp_path, capsys, write(tmp_path, unrounded, HD), *intrinsics)
-    assert "1/5000 m: the camera is that of ICL-NUIM" in printed
-    replica = np.round(cv2.resize(DEPTH, (1200, 680)) * 6553.5).astype(np.uint16)
-    assert upsample(*write(tmp_path, replica, (1200, 680)), "-o", tmp_path / "r", "--dry-run") == 0
-    assert "1/6553.5 m: 1200 x 680 is the size of Replica's maps" in capsys.readouterr().out
+    assert upsample(*write(tmp_path, unrounded, HD), *intrinsics, "-o", tmp_path / "i", "--dry-run") == 0
+    assert "1/5000 m: the camera is that of ICL-NUIM" in capsys.readouterr().out
     lines = np.where(np.random.default_rng(1).random((375, 1242)) < 0.05, cv2.resize(DEPTH, (1242, 375)) * 5 * 256, 0)
     assert upsample(*write(tmp_path, lines.astype(np.uint16), (1242, 375)), "-o", tmp_path / "k", "--dry-run") == 0
     assert "1/256 m: size and holes are those of KITTI's maps" in capsys.readouterr().out
@@ -98,15 +90,10 @@ def test_sizes_and_cameras_of_known_data_sets_give_the_unit(tmp_path, capsys):
     [
         (np.round(DEPTH * 5000).astype(np.uint16), ("--depth-unit mm (", "--depth-unit 1/5000 (")),
         (DEPTH * 100, ("--depth-unit cm (", "--depth-unit mm (")),
-        (DEPTH * 50, ("--depth-unit cm (", "--depth-unit m (")),
         (DISPARITY, ("--range-type disparity with --baseline", "--range-type orthogonal")),
-        (np.round(DISPARITY * 256).astype(np.uint16), ("--range-type disparity with --baseline", "orthogonal")),
         (np.round(DISPARITY).astype(np.uint16), ("--depth-unit cm (", "--range-type disparity")),
         ((1 / DEPTH).astype(np.float32), ("--range-type disparity", "inverse depth of a network has no metric unit")),
-        (900 / DEPTH, ("--range-type disparity", "inverse depth of a network has no metric unit")),
         ((DEPTH - DEPTH.min()) / np.ptp(DEPTH), ("normalised", "--depth-unit METRES")),
-        (20 * (DEPTH - DEPTH.min()) / np.ptp(DEPTH), ("normalised", "--depth-unit METRES")),
-        (np.round(255 * DEPTH / DEPTH.max()) / 255, ("normalised", "--depth-unit METRES")),
         (np.uint16(257) * np.round(255 * DEPTH / DEPTH.max()).astype(np.uint16), ("for viewing", "--depth-unit")),
         (np.round(255 * DEPTH / DEPTH.max()).astype(np.uint8), ("uint8", "for viewing")),
         (np.where(np.random.default_rng(2).random(DEPTH.shape) < 0.1, MILLIMETRES, 0).astype(np.uint16),
@@ -126,7 +113,6 @@ def test_what_has_two_likely_readings_or_no_unit_is_asked_for_in_one_line(tmp_pa
     [
         (cv2.applyColorMap(np.uint8(255 * DEPTH / DEPTH.max()), cv2.COLORMAP_JET), "a picture in colour"),
         (np.dstack([np.uint8(255 * DEPTH / DEPTH.max())] * 3), "three equal channels"),
-        (np.random.default_rng(3).integers(0, 256, (96, 128, 3), np.uint8), "a picture in colour"),
     ],
 )
 def test_pictures_for_viewing_are_named_by_their_kind(tmp_path, capsys, picture, expected):
@@ -134,14 +120,12 @@ def test_pictures_for_viewing_are_named_by_their_kind(tmp_path, capsys, picture,
 
 
 def test_an_option_answers_what_was_asked(tmp_path, capsys):
-    for number, (values, options) in enumerate([
-        (np.round(DEPTH * 5000).astype(np.uint16), ("--depth-unit", "1/5000")), (DEPTH * 100, ("--depth-unit", "cm")),
+    for values, options in (
+        (np.round(DEPTH * 5000).astype(np.uint16), ("--depth-unit", "1/5000")),
         (DISPARITY, ("--range-type", "disparity", "--baseline", BASELINE)),
-    ]):  # fmt: skip
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        assert warned(folder, capsys, write(folder, values), *options)[0] == []
-        assert np.median(metres(folder / "out")) == pytest.approx(np.median(DEPTH), rel=0.02)
+    ):
+        assert warned(tmp_path, capsys, write(tmp_path, values), *options, "--overwrite")[0] == []
+        assert np.median(metres(tmp_path / "out")) == pytest.approx(np.median(DEPTH), rel=0.02)
 
 
 def test_whole_centimetres_of_a_room_are_not_taken_for_a_near_thing_in_silence(tmp_path, capsys):
@@ -180,8 +164,6 @@ def test_planes_warn_of_distances_along_the_ray_and_of_disparities_given_as_dept
         ((575, 5, 127.5, 95.5), ["focal-ratio"], "fx 575 and fy 5 px differ"),
         ((4000, 4000, 127.5, 95.5), ["view-narrow"], "field of view of 3.67 degrees"),
         ((4.2, 4.2, 127.5, 95.5), ["view-wide"], "field of view of 176 degrees"),
-        ((1000, 1000, 127.5, 95.5), [], ""),
-        ((220, 220, 100, 80), [], ""),
     ],
 )
 def test_cameras_that_can_hardly_be_right_are_warned_of(tmp_path, capsys, intrinsics, codes, said):
@@ -194,10 +176,6 @@ def test_a_camera_that_cannot_see_its_picture_is_refused(tmp_path, capsys):
     files = write(tmp_path, MILLIMETRES)
     line = refused_line(capsys, upsample(*files, "--intrinsics", 220, 220, 1e9, 95.5, "-o", tmp_path / "out"))
     assert line.startswith("--intrinsics: expected a principal point in or near the picture of 256 x 192 pixels")
-    content = {"width": 256, "height": 192, "fx": 220, "fy": 220, "cx": 127.5, "cy": -1e9}
-    (tmp_path / "camera.json").write_text(json.dumps(content))
-    line = refused_line(capsys, upsample(*files, "-o", tmp_path / "out"))
-    assert line.startswith(f"{tmp_path / 'camera.json'}: expected a principal point")
 
 
 @pytest.mark.parametrize(("baseline", "code"), [(100, "baseline-long"), (0.1 / 1000, "baseline-short")])
@@ -210,25 +188,13 @@ def test_a_baseline_in_another_unit_is_warned_of(tmp_path, capsys, baseline, cod
     assert codes == [code]
 
 
-def folder_of(place, maps, cameras=()):
-    """Write a folder of pairs, each with a camera of its own if there are some, and return it."""
+def folder_of(folder, maps):
+    """Write a folder of photos and maps."""
+    folder.mkdir()
     for number, values in enumerate(maps):
-        frame = place / f"{number:03}" if cameras else place
-        for kind in ("rgb", "depth"):
-            (frame / kind).mkdir(parents=True, exist_ok=True)
-        Image.fromarray(np.full((192, 256, 3), 99, np.uint8)).save(frame / "rgb" / f"{number:03}.png")
-        cv2.imwrite(str(frame / "depth" / f"{number:03}.png"), values)
-        if cameras:
-            camera = {
-                "width": 256,
-                "height": 192,
-                "cx": 127.5,
-                "cy": 95.5,
-                "fx": cameras[number],
-                "fy": cameras[number],
-            }
-            (frame / "camera.json").write_text(json.dumps(camera))
-    return place
+        Image.fromarray(np.full((192, 256, 3), 99, np.uint8)).save(folder / f"{number}_photo.png")
+        np.save(folder / f"{number}_depth.npy", values)
+    return folder
 
 
 def test_near_frame_of_a_folder_makes_no_other_doubtful(tmp_path):
@@ -245,14 +211,8 @@ def test_what_most_of_the_maps_of_a_folder_show_applies_to_all_of_them(tmp_path,
         ("most", (along_the_ray, along_the_ray, wall), [["along-the-ray"]] * 3),
         ("one", (along_the_ray, DEPTH, DEPTH), [[]] * 3),
     ):
-        folder = tmp_path / name
-        folder.mkdir()
-        for number, values in enumerate(maps):
-            Image.fromarray(np.full((192, 256, 3), 99, np.uint8)).save(folder / f"{number}_photo.png")
-            np.save(folder / f"{number}_depth.npy", values)
+        folder = folder_of(tmp_path / name, maps)
         assert upsample(folder, "-o", tmp_path / "out" / name) == 0
         assert capsys.readouterr().out.count("warning: depth looks like distance along the ray") == (name == "most")
-        found = [
-            json.loads((tmp_path / "out" / name / f"{number}_photo" / "info.json").read_text()) for number in range(3)
-        ]
-        assert [[each["code"] for each in info["warnings"]] for info in found] == expected
+        found = [info(tmp_path / "out" / name / f"{number}_photo")["warnings"] for number in range(3)]
+        assert [[each["code"] for each in warnings] for warnings in found] == expected

@@ -14,7 +14,6 @@ from upsampling import info, refused_line, upsample
 from dsr.geometry.camera import Camera
 from dsr.io.depth_files import read_depth_file, write_depth_file
 from dsr.synthetic.simgeo import render_scene
-from dsr.utils.progress import megabytes
 
 PARTS = {
     "depth": ("depth.png", "depth_metres.tiff"),
@@ -101,8 +100,6 @@ def test_wide_holes_stay_holes_and_it_is_said(pair, tmp_path, capsys):
         assert of(pair, tmp_path / name, *options, *extra) == 0
         assert np.asarray(Image.open(tmp_path / name / "depth.png")).min() > 0
         assert "stay holes" not in capsys.readouterr().out
-    message = refused_line(capsys, of(pair, tmp_path / "wrong", *options, "--max-hole", "-1"))
-    assert message == "--max-hole: expected a positive number of degrees, got -1"
 
 
 def test_outliers_are_holes_and_it_is_said(pair, tmp_path, capsys):
@@ -140,10 +137,7 @@ def test_glass_is_said_and_a_robot_gets_no_depth_there(pair, tmp_path, capsys, m
     assert depth[:, 16:].any()
 
 
-@pytest.mark.parametrize(
-    ("suffix", "factor", "dtype"),
-    [("tiff", 1000, "f4"), ("npy", 1000, "f4"), ("pfm", 1000, "f4"), ("exr", 1000, "f4"), ("npz", 1, "f8")],
-)
+@pytest.mark.parametrize(("suffix", "factor", "dtype"), [("exr", 1000, "f4"), ("npz", 1, "f8")])
 def test_result_has_the_inputs_format_type_unit_and_holes(pair, tmp_path, suffix, factor, dtype):
     photo, _, values = pair
     metres = np.where(values == 0, np.nan, values / 1000)
@@ -159,19 +153,16 @@ def test_result_has_the_inputs_format_type_unit_and_holes(pair, tmp_path, suffix
     assert 0 < np.isnan(stored).mean() < 0.1
 
 
-@pytest.mark.parametrize("suffix", ["tiff", "exr"])
-def test_floats_in_metres_are_written_once_unless_a_format_is_chosen(pair, tmp_path, suffix):
-    depth, out = tmp_path / f"d.{suffix}", tmp_path / "out"
+def test_floats_in_metres_are_written_once_unless_a_format_is_chosen(pair, tmp_path):
+    depth, out = tmp_path / "d.exr", tmp_path / "out"
     write_depth_file(depth, np.where(pair[2] == 0, np.nan, pair[2] / 1000).astype("f4"))
     assert of((pair[0], depth), out, *DEPTH_ONLY) == 0
     assert files_in(out) == {"depth_metres.tiff", "info.json"}
     stored = {"suffix": ".tiff", "dtype": "float32", "unit": 1.0, "hole": "nan", "range_type": "orthogonal"}
     assert (info(out)["depth_metres"], info(out)["depth_file"]) == ({"file": "depth_metres.tiff", **stored}, stored)
-    assert of((pair[0], depth), out, *DEPTH_ONLY, "--overwrite", "--format", suffix) == 0
-    assert files_in(out) == {f"depth.{suffix}", "depth_metres.tiff", "info.json"}
-    np.testing.assert_array_equal(
-        *(read_depth_file(out / f"{name}") for name in (f"depth.{suffix}", "depth_metres.tiff"))
-    )
+    assert of((pair[0], depth), out, *DEPTH_ONLY, "--overwrite", "--format", "exr") == 0
+    assert files_in(out) == {"depth.exr", "depth_metres.tiff", "info.json"}
+    np.testing.assert_array_equal(*(read_depth_file(out / name) for name in ("depth.exr", "depth_metres.tiff")))
 
 
 def test_what_was_measured_and_what_was_filled_is_distinguished(pair, tmp_path, capsys):
@@ -217,11 +208,9 @@ def test_result_for_a_robot_has_millimetres_of_certain_measured_depth_alone(pair
         assert not depth[dubious].any()
         assert not np.asarray(Image.open(out / "filled.png")).any()
     for more in (("--fill", "all"), ("--format", "exr")):
-        assert of(pair, tmp_path / "no", *BICUBIC, "--for", "robot", *more) == 2
-        error = capsys.readouterr().err.strip()
-        assert error.count("\n") == 0
-        assert f"--for robot: expected {more[0]}" in error
-        assert not (tmp_path / "no").exists()
+        code = of(pair, tmp_path / "no", *BICUBIC, "--for", "robot", *more)
+        assert f"--for robot: expected {more[0]}" in refused_line(capsys, code)
+    assert not (tmp_path / "no").exists()
 
 
 def test_disparity_becomes_disparity_of_the_high_resolution_pixels(pair, cube, tmp_path):
@@ -245,11 +234,8 @@ def test_repeated_command_does_nothing_and_new_outputs_need_no_new_depth(pair, t
     assert times == {name: (out / name).stat().st_mtime_ns for name in files_in(out)}
     monkeypatch.setattr("dsr.inference.AnyRatio.upsample", None)
     assert of(pair, out, *BICUBIC, "--only", "normals") == 0
-    assert (
-        files_in(out)
-        == {"depth.png", "depth_metres.tiff", "normals.png", "info.json"}
-        == {*info(out)["files"], "info.json"}
-    )
+    assert files_in(out) == {"depth.png", "depth_metres.tiff", "normals.png", "info.json"}
+    assert files_in(out) == {*info(out)["files"], "info.json"}
     assert of(pair, out, *BICUBIC, "--only", "normals,depth") == 0
     assert "photo: complete already" in capsys.readouterr().out
 
@@ -259,10 +245,10 @@ def test_result_of_other_settings_or_inputs_is_kept_unless_overwritten(pair, tmp
     assert of(pair, out, *DEPTH_ONLY) == 0
     before = (out / "depth.png").read_bytes()
     message = refused_line(capsys, of(pair, out, *DEPTH_ONLY, "--fov", 70))
-    assert message == f"{out}: holds a result of other settings: no fov; take another -o, or --overwrite"
+    assert message.startswith(f"{out}: holds a result of other settings: no fov")
     Image.fromarray(pair[2] + np.uint16(100)).save(pair[1])
     message = refused_line(capsys, of(pair, out, *DEPTH_ONLY))
-    assert message == f"{out}: holds a result of other inputs: photo.png, depth.png; take another -o, or --overwrite"
+    assert message.startswith(f"{out}: holds a result of other inputs: photo.png, depth.png")
     assert (out / "depth.png").read_bytes() == before
     assert of(pair, out, *DEPTH_ONLY, "--overwrite", "--format", "npy") == 0
     assert files_in(out) == {"depth.npy", "depth_metres.tiff", "info.json"}
@@ -284,10 +270,9 @@ def test_interrupted_run_resumes(pair, tmp_path, capsys, monkeypatch):
 
 
 def test_result_overwrites_neither_its_input_nor_foreign_files(pair, tmp_path, capsys):
-    assert "depth.png: the result would overwrite its input" in refused_line(capsys, of(pair, tmp_path, *DEPTH_ONLY))
-    assert "the result would overwrite its input" in refused_line(
-        capsys, of(pair, tmp_path, *DEPTH_ONLY, "--overwrite")
-    )
+    for more in ((), ("--overwrite",)):
+        message = refused_line(capsys, of(pair, tmp_path, *DEPTH_ONLY, *more))
+        assert "depth.png: the result would overwrite its input" in message
     out = tmp_path / "out"
     out.mkdir()
     (out / "mesh.ply").write_text("mine")
@@ -306,30 +291,19 @@ def test_broken_picture_does_not_stop_the_others(pair, tmp_path, capsys):
     (frames / "depth" / "000001.png").write_bytes(pair[1].read_bytes()[:60])
     (frames / "rgb" / "000007.png").touch()
     out = tmp_path / "out"
-    code = upsample(frames, "-o", out, *DEPTH_ONLY)
+    assert upsample(frames, "-o", out, *DEPTH_ONLY) == 2
     reported = capsys.readouterr()
-    assert code == 2
-    assert reported.err == (
-        f"error: 000001: {frames}/depth/000001.png: expected a picture, got a damaged or foreign file of 60 bytes\n"
-    )
-    assert (
-        "3 pairs of photo and depth map\n  folders rgb and depth\n  1 without a partner, left out: 000007.png"
-        in reported.out
-    )
-    for name in ("000000", "000002"):
-        [line] = [line for line in reported.out.splitlines() if name in line]
-        assert line.startswith(f"{name}: ")
-        assert line.endswith(f" -> {out / name}")
+    [line] = reported.err.splitlines()
+    assert line.startswith(f"error: 000001: {frames}/depth/000001.png: expected a picture")
+    assert "3 pairs of photo and depth map\n  folders rgb and depth\n" in reported.out
+    assert "1 without a partner, left out: 000007.png" in reported.out
+    assert re.findall(r"^(\d+): .* -> .*/\1$", reported.out, re.MULTILINE) == ["000000", "000002"]
     assert reported.out.count("degrees of horizontal view assumed") == 1
     assert re.search(rf"3 pictures: 2 done, 1 failed in 0:00:\d\d, \d+ kB -> {re.escape(str(out))}", reported.out)
-    assert files_in(out) == {
-        f"{name}/{file}" for name in ("000000", "000002") for file in ("depth.png", "depth_metres.tiff", "info.json")
-    }
+    assert sorted(path.name for path in out.iterdir()) == ["000000", "000002"]
     shutil.copy(pair[1], frames / "depth" / "000001.png")
     assert upsample(frames, "-o", out, *DEPTH_ONLY) == 0
-    said = capsys.readouterr().out
-    assert "3 pictures: 2 complete already, 1 done in 0:00:" in said
-    assert f", {megabytes(sum((out / name).stat().st_size for name in files_in(out)))} -> {out}\n" in said
+    assert "3 pictures: 2 complete already, 1 done in 0:00:" in capsys.readouterr().out
 
 
 def test_sensor_is_recognised_by_the_depth_values_and_must_not_contradict_them(tmp_path, capsys):
@@ -352,20 +326,16 @@ def test_sensor_is_recognised_by_the_depth_values_and_must_not_contradict_them(t
     ("arguments", "message"),
     [
         (("--method", "magic"), "--method: expected one of"),
-        (("--format", "jpg"), "--format: expected one of png, tiff, npy, npz, pfm, exr, mm, got 'jpg'"),
-        (("--only", "depth,film"), "--only, --with, --without: expected some of depth, renderings"),
+        (("--format", "jpg"), "--format: expected one of"),
+        (("--only", "depth,film"), "--only, --with, --without: expected some of"),
         (("--only", ","), "expected something to be left to write"),
-        (("--depth-unit", "inch"), "--depth-unit: expected m, cm, mm or metres per value"),
-        (("--baseline", "0"), "--baseline: expected a positive number of metres, got 0"),
-        (("--fov", "200"), "--fov: expected degrees from 1 to below 180, got 200"),
+        (("--depth-unit", "inch"), "--depth-unit: expected"),
+        (("--fov", "200"), "--fov: expected degrees"),
         (("--range-type", "disparity"), "depth.png: disparities need the distance between the two cameras"),
-        (("--method", "facets", "--noise", "-1"), "--noise: expected metres, 0 or more and less than 1, got -1.0"),
-        (("--method", "facets", "--smooth", "3"), "--smooth: expected a number from 0 to 2, got 3.0"),
+        (("--method", "facets", "--noise", "-1"), "--noise: expected metres"),
+        (("--method", "facets", "--smooth", "3"), "--smooth: expected a number"),
         (("--noise", "0.1", "--method", "tgv"), "--noise: unknown key; method=tgv takes"),
-        (("--max-faces", "99"), "--max-faces: expected at least 100, got 99"),
-        (("--max-points", "0"), "--max-points: expected at least 100, got 0"),
-        (("--max-error", "0"), "--max-error: expected a positive percentage of the depth, got 0"),
-        (("--workers", "0"), "--workers: expected 1 or more, got 0"),
+        (("--max-hole", "-1"), "--max-hole: expected a positive number"),
         (("some_folder",), "expected --rgb and --depth, or folders that hold both"),
     ],
 )
@@ -389,21 +359,17 @@ def test_photos_and_depth_maps_in_two_arguments_are_refused_with_the_options_for
 def test_pictures_that_do_not_fit_each_other_are_refused_in_one_line(pair, tmp_path, capsys):
     photo, depth, _ = pair
     for name, array, message in (
-        (
-            "large.png",
-            np.ones((128, 128), np.uint16),
-            "expected no more pixels than the photo, got 128 x 128; the photo photo.png has 64 x 64",
-        ),
-        ("wide.png", np.full((9, 16), 1000, np.uint16), "expected the photo's aspect and field of view, got 16 x 9"),
+        ("large.png", np.ones((128, 128), np.uint16), "expected no more pixels than the photo"),
+        ("wide.png", np.full((9, 16), 1000, np.uint16), "expected the photo's aspect and field of view"),
         ("eight.png", np.full((16, 16), 7, np.uint8), "too coarse for depth"),
-        ("holes.png", np.zeros((16, 16), np.uint16), "expected at least one known pixel, all are holes"),
-        ("one.png", np.full((1, 1), 1000, np.uint16), "expected at least 2 x 2 pixels, got 1 x 1"),
+        ("holes.png", np.zeros((16, 16), np.uint16), "expected at least one known pixel"),
+        ("one.png", np.full((1, 1), 1000, np.uint16), "expected at least 2 x 2 pixels"),
     ):
         Image.fromarray(array).save(tmp_path / name)
         assert message in refused_line(capsys, of((photo, tmp_path / name), tmp_path / "out", *DEPTH_ONLY))
     cv2.imwrite(str(tmp_path / "mask.png"), np.ones((64, 64), np.uint8))
     message = refused_line(capsys, of(pair, tmp_path / "out", *DEPTH_ONLY, "--mask", tmp_path / "mask.png"))
-    assert "mask.png: expected a mask of the depth map's 16 x 16 pixels (width x height), got 64 x 64" in message
+    assert "mask.png: expected a mask of the depth map's 16 x 16 pixels" in message
     (tmp_path / "photo.heic").touch()
     assert "photo.heic: " in refused_line(capsys, of((tmp_path / "photo.heic", depth), tmp_path / "out", *DEPTH_ONLY))
     assert "--rgb: " in refused_line(capsys, of((tmp_path / "none.jpg", depth), tmp_path / "out", *DEPTH_ONLY))
@@ -416,23 +382,17 @@ def test_noise_is_estimated_and_may_be_given(cube, tmp_path, capsys):
     np.save(tmp_path / "noisy.npy", coarse * (1 + 0.01 * noise))
     Image.fromarray(cube.rgb).save(tmp_path / "photo.png")
     given = (tmp_path / "photo.png", tmp_path / "noisy.npy")
-    results = {}
-    for name, options in {
-        "own": (),
-        "none": ("--noise", "0"),
-        "much": ("--noise", "0.05"),
-        "keep": ("--smooth", "0"),
-    }.items():
-        assert of(given, tmp_path / name, "--only", "depth", *options) == 0
-        said = capsys.readouterr().out
-        assert ("noise of the depth map (about " in said) == ("--noise" not in options)
-        if "--noise" not in options:
-            estimate = float(said.split("noise of the depth map (about ")[1].split(" mm")[0])
-            assert 0.2 * 10 * np.median(coarse) < estimate < 5 * 10 * np.median(coarse)
-        results[name] = read_depth_file(tmp_path / name / "depth_metres.tiff")
-    assert info(tmp_path / "much")["settings"]["set"] == {"noise": 0.05}
-    for name, other in (("own", "none"), ("own", "much"), ("none", "much"), ("own", "keep")):
-        assert not np.array_equal(results[name], results[other])
+    results, said = [], []
+    for options in ((), ("--noise", "0.05"), ("--smooth", "0")):
+        out = tmp_path / str(len(results))
+        assert of(given, out, "--only", "depth", *options) == 0
+        said.append(capsys.readouterr().out)
+        results.append(read_depth_file(out / "depth_metres.tiff"))
+    assert ["noise of the depth map (about " in each for each in said] == [True, False, True]
+    estimate = float(said[0].split("noise of the depth map (about ")[1].split(" mm")[0])
+    assert 0.2 * 10 * np.median(coarse) < estimate < 5 * 10 * np.median(coarse)
+    assert info(tmp_path / "1")["settings"]["set"] == {"noise": 0.05}
+    assert not any(np.array_equal(results[0], other) for other in results[1:])
 
 
 def test_what_is_likely_to_be_wrong_is_left_out_of_the_mesh(pair, tmp_path, capsys):
@@ -465,7 +425,7 @@ def test_dry_run_reads_all_and_says_what_would_be_done(tmp_path, capsys):
     capsys.readouterr()
     assert upsample(folder, "-o", tmp_path / "out", *DEPTH_ONLY, "--dry-run") == 2
     said = capsys.readouterr()
-    assert "1_depth.png: expected a picture" in said.err or "holds a result of other inputs" in said.err
+    assert said.err.count("\n") == 1
     assert f"3 pictures: 1 complete already, 1 to do, 1 failed -> {tmp_path / 'out'}\n" in said.out
 
 

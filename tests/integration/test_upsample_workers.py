@@ -1,14 +1,13 @@
-"""``dsr upsample --workers``: the same results from several processes, problems and all."""
+"""``dsr upsample`` in several processes: ``--workers`` and ``--shard`` give what one command alone gives."""
 
 import json
+from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
+from small_frames import FRAMES, results, write_frames
+from upsampling import refused_line, upsample
 
-from dsr.cli import main
-
-FAST = ("--method", "bicubic", "--only", "depth,before_after", "--fov", "60", "--depth-unit", "mm")
+FAST = ("--method", "bicubic", "--only", "depth,normals,input", "--fov", "60")
 KILLER = '''
 import os, signal
 from pathlib import Path
@@ -16,7 +15,7 @@ from pathlib import Path
 from dsr.methods.base import Method
 
 class Killer(Method):
-    """Repeats pixels; is killed at maps of about 1.3 m, several times, as if for want of memory."""
+    """Repeats pixels; is killed at maps of 1.4 m, several times, as if for want of memory."""
 
     range_type = "orthogonal"
 
@@ -24,76 +23,92 @@ class Killer(Method):
         self.marks, self.times = Path(marks), times
 
     def __call__(self, sample, progress=None):
-        if 1.29 < float(sample.depth_lr.min()) < 1.31 and len(list(self.marks.iterdir())) < self.times:
+        if float(sample.depth_lr.min()) > 1.3 and len(list(self.marks.iterdir())) < self.times:
             (self.marks / str(os.getpid())).touch()
             os.kill(os.getpid(), signal.SIGKILL)
         return sample.depth_lr.repeat_interleave(4, 1).repeat_interleave(4, 2)
 '''
 
 
-def make_frames(folder, count):
-    """Write a folder of frames whose depth begins at 1 m, 1.1 m, ..."""
-    rng = np.random.default_rng(0)
-    for kind in ("rgb", "depth"):
-        (folder / kind).mkdir(parents=True)
-    for number in range(count):
-        photo = rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)
-        Image.fromarray(photo).save(folder / "rgb" / f"{number:03}.png")
-        depth = (1000 + 100 * number + np.arange(16)[None] * 10 + np.zeros((12, 1))).astype(np.uint16)
-        Image.fromarray(depth).save(folder / "depth" / f"{number:03}.png")
-    return folder
-
-
 @pytest.fixture
 def folder(tmp_path):
-    """Return a folder of five frames, of which one has a damaged depth map."""
-    frames = make_frames(tmp_path / "frames", 5)
-    (frames / "depth" / "002.png").write_bytes(b"\x89PNG nothing")
-    return frames
-
-
-@pytest.fixture
-def killing(tmp_path, monkeypatch):
-    """Return a function that upsamples eight frames with two workers that are killed so many times at the fourth."""
-    (tmp_path / "modules").mkdir()
-    (tmp_path / "modules" / "killing.py").write_text(KILLER)
-    monkeypatch.syspath_prepend(tmp_path / "modules")
-    (tmp_path / "conf" / "method").mkdir(parents=True)
-    (tmp_path / "marks").mkdir()
-    node = f"_target_: killing.Killer\nmarks: {tmp_path / 'marks'}\ntimes: 0\n"
-    (tmp_path / "conf" / "method" / "killer.yaml").write_text(node)
-    frames = str(make_frames(tmp_path / "frames", 8))
-    options = ("--config-dir", str(tmp_path / "conf"), "--only", "depth", "--fov", "60", "--depth-unit", "mm")
-
-    def run(times):
-        method = ("--method", "killer", "--set", f"times={times}", "--workers", "2")
-        return main(["upsample", frames, "-o", str(tmp_path / "out"), *options, *method])
-
-    return run
-
-
-def test_pictures_of_workers_that_are_killed_twice_fail_and_the_same_command_goes_on(killing, tmp_path, capsys):
-    assert killing(2) == 2
-    assert " killed " in capsys.readouterr().err
-    assert not (tmp_path / "out" / "003" / "depth.png").exists()
-    assert killing(2) == 0
-    assert len(list((tmp_path / "out").glob("*/depth.png"))) == 8
+    return write_frames(tmp_path / "frames")
 
 
 def test_several_workers_write_what_one_writes(folder, tmp_path, capsys):
-    assert main(["upsample", str(folder), "-o", str(tmp_path / "one"), *FAST]) == 2
-    alone = capsys.readouterr()
-    assert main(["upsample", str(folder), "-o", str(tmp_path / "two"), *FAST, "--workers", "2"]) == 2
-    both = capsys.readouterr()
-    assert "5 pictures: 4 done, 1 failed" in both.out
-    assert [line for line in alone.err.splitlines() if "error" in line] == [
-        line for line in both.err.splitlines() if "error" in line
-    ]
-    for name in ("000", "001", "003", "004"):
-        first, second = (tmp_path / run / name for run in ("one", "two"))
-        assert (first / "depth.png").read_bytes() == (second / "depth.png").read_bytes()
-        assert (first / "before_after.png").is_file() == (second / "before_after.png").is_file()
-        reported, other = (json.loads((place / "info.json").read_text()) for place in (first, second))
-        assert {**reported, "seconds": 0} == {**other, "seconds": 0}
-    assert main(["upsample", str(folder), "-o", str(tmp_path / "two"), *FAST]) == 2
-    assert "4 complete already" in capsys.readouterr().out
+    (folder / "depth" / "004.png").write_bytes(b"\x89PNG nothing")
+    reported = []
+    for workers in ("1", "2"):
+        assert upsample(folder, "-o", tmp_path / workers, *FAST, "--workers", workers) == 2
+        said = capsys.readouterr()
+        assert "7 pictures: 4 done, 3 failed" in said.out
+        reported.append(sorted(said.err.splitlines()))
+    assert reported[0] == reported[1]
+    assert results(tmp_path / "1") == results(tmp_path / "2")
+
+
+def test_pictures_of_workers_that_are_killed_twice_fail_and_the_same_command_goes_on(tmp_path, monkeypatch, capsys):
+    for name in ("modules", "marks", "conf/method"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "modules" / "killing.py").write_text(KILLER)
+    monkeypatch.syspath_prepend(tmp_path / "modules")
+    node = f"_target_: killing.Killer\nmarks: {tmp_path / 'marks'}\ntimes: 2\n"
+    (tmp_path / "conf" / "method" / "killer.yaml").write_text(node)
+    folder, out = write_frames(tmp_path / "frames", 2, holes=0), tmp_path / "out"
+    command = (folder, "-o", out, "--config-dir", tmp_path / "conf", "--method", "killer", *FAST[2:], "--workers", "2")
+    assert upsample(*command) == 2
+    assert " killed " in capsys.readouterr().err
+    assert upsample(*command) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["000", "001"]
+
+
+@pytest.mark.parametrize("case", ["alone", "neighbours"])
+def test_shards_together_give_what_one_command_gives(folder, tmp_path, capsys, case):
+    options = [*FAST]
+    if case == "neighbours":
+        rows = [f"1 0 0 {0.01 * number} 0 1 0 0 0 0 1 0\n" for number in range(FRAMES)]
+        (tmp_path / "poses.txt").write_text("".join(rows))
+        options += ["--poses", tmp_path / "poses.txt", "--neighbours", "2"]
+    code = upsample(folder, "-o", tmp_path / "whole", *options)
+    codes = {upsample(folder, "--shard", f"{number}/3", "-o", tmp_path / "parts", *options) for number in (3, 1, 2)}
+    assert max(codes) == code
+    whole = results(tmp_path / "whole")
+    assert len(whole) > 4 * FRAMES // 2
+    assert results(tmp_path / "parts") == whole
+    capsys.readouterr()
+    assert upsample(folder, "-o", tmp_path / "parts", *options) == code
+    done = len({Path(name).parts[0] for name in whole})
+    assert f"{done} complete already" in capsys.readouterr().out
+
+
+def test_shard_alone_works_on_its_block_and_says_how_it_went(folder, tmp_path, capsys):
+    (folder / "depth" / "003.png").write_bytes(b"\x89PNG nothing")
+    for number in (1, 2):
+        assert upsample(folder, "--shard", f"{number}/9", "-o", tmp_path / "out", *FAST) == (2 if number == 2 else 0)
+    said = capsys.readouterr().out
+    assert "shard 1/9: no frame of 7" in said
+    assert "shard 2/9: frames 1 to 1 of 7" in said
+    assert upsample(folder, "--shard", "2/3", "-o", tmp_path / "out", *FAST) == 2
+    summary = json.loads((tmp_path / "out" / "shard-2-of-3.json").read_text())
+    assert (summary["shard"], summary["outcomes"]) == ("2/3", {"done": 1})
+    assert [each["frames"] for each in summary["failed"]] == [["003"]]
+    assert "003.png" in summary["failed"][0]["problem"]
+
+
+def test_bad_shards_are_refused_in_one_line(folder, tmp_path, capsys):
+    for shard in ("17/16", "0/16", "-1/2", "3", "1/2/3", "a/b"):
+        line = refused_line(capsys, upsample(folder, f"--shard={shard}", "-o", tmp_path / "out"))
+        assert line.startswith("--shard: expected K/N")
+        assert line.endswith(f"got {shard!r}")
+    assert not (tmp_path / "out").exists()
+
+
+def test_warnings_of_a_shard_are_in_its_summary_and_reported_again_once_it_is_complete(folder, tmp_path, capsys):
+    options = (*FAST[:-2], "--fov", "4", "-o", tmp_path / "out")
+    for _ in range(2):
+        assert upsample(folder, "--shard", "2/2", *options) == 0
+        assert capsys.readouterr().out.count("warning: ") == 1
+        [warning] = json.loads((tmp_path / "out" / "shard-2-of-2.json").read_text())["warnings"]
+        assert (warning["code"], warning["pictures"], warning["threshold"]) == ("view-narrow", 4, 5)
+        assert warning["value"] == pytest.approx(4, abs=0.1)
+    assert "view" in refused_line(capsys, upsample(folder, "--shard", "2/2", "--strict", *options))

@@ -14,7 +14,6 @@ from dsr.geometry.surface import render_for_viewing
 from dsr.pictures.depth_views import normals_seen_by
 
 SPITEFUL = "<img src=x onerror=alert(1)>'&"
-DESKTOP = {"width": 900, "height": 900}
 
 
 @pytest.fixture(scope="module")
@@ -33,69 +32,28 @@ def page_of_two(tmp_path_factory):
     return (folder / "view.html").as_uri()
 
 
-class Window:
-    """A page, and what it said or asked for that it should not have."""
-
-    def __init__(self, browser, **options):
-        self.context = browser.new_context(**({"viewport": DESKTOP} | options))
-        self.page, self.wrong = self.context.new_page(), []
-        self.page.on("console", lambda message: self.wrong.append(message.text))
-        self.page.on("pageerror", lambda error: self.wrong.append(str(error)))
-        self.page.on("dialog", lambda dialog: (self.wrong.append(dialog.message), dialog.dismiss()))
-        self.page.on("request", lambda request: None if harmless(request.url) else self.wrong.append(request.url))
-
-    def open(self, url):
-        self.page.goto(url)
-        self.page.wait_for_selector(".stage[data-shown]")
-        return self
-
-    def press(self, *keys):
-        for key in keys:
-            self.page.keyboard.press(key)
-        return self
-
-    def seen(self, hide=(".divider", ".name", ".zoom")):
-        """Return the stage as it is on the screen, (h, w, 3), without what lies upon the surface."""
-        self.page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-        self.page.evaluate("document.querySelector('#stage').style.outline = 'none'")
-        for selector in hide:
-            self.page.evaluate("(s) => document.querySelectorAll(s).forEach((e) => e.style.opacity = 0)", selector)
-        content = self.page.locator("#stage").screenshot()
-        return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
-
-    def drag(self, start, end, button="left"):
-        """Drag from one place of the stage to another, both as fractions of it."""
-        box = self.page.locator("#stage").bounding_box()
-        place = lambda part: (box["x"] + part[0] * box["width"], box["y"] + part[1] * box["height"])  # noqa: E731
-        mouse = self.page.mouse
-        mouse.move(*place(start))
-        mouse.down(button=button)
-        mouse.move(*place(end), steps=3)
-        mouse.up(button=button)
-        return self
-
-    def label(self):
-        self.page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-        return self.page.locator("#stage canvas").get_attribute("aria-label")
+def opened(window, url):
+    """Open a page; its stage is about as wide as it is high."""
+    shown = window(viewport={"width": 900, "height": 900})
+    shown.page.goto(url)
+    shown.page.wait_for_selector(".stage[data-shown]")
+    return shown
 
 
-def harmless(url):
-    return url.startswith(("data:", "blob:", "about:")) or (url.startswith("file:") and ".html" in url)
+def seen(shown, *keys):
+    """Press keys, and return the stage as it is on the screen, (h, w, 3), without what lies upon the surface."""
+    shown.press(*keys)
+    shown.settle()
+    shown.page.evaluate("document.querySelector('#stage').style.outline = 'none'")
+    for selector in (".divider", ".name", ".zoom"):
+        shown.page.evaluate("(s) => document.querySelectorAll(s).forEach((e) => e.style.opacity = 0)", selector)
+    content = shown.page.locator("#stage").screenshot()
+    return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
 
 
-@pytest.fixture
-def window(webgl_browser):
-    """Return what makes a window; errors and requests of its page fail the test at its end."""
-    windows = []
-
-    def make(**options):
-        windows.append(Window(webgl_browser, **options))
-        return windows[-1]
-
-    yield make
-    for each in windows:
-        each.context.close()
-        assert each.wrong == []
+def label(shown):
+    shown.settle()
+    return shown.page.locator("#stage canvas").get_attribute("aria-label")
 
 
 def at(picture, u, v, size=SIZE):
@@ -114,8 +72,8 @@ def magma(level):
 
 def test_surface_is_the_results_own_in_every_light_and_from_every_side(window, page_of_one):
     """One visit: rendering, holes, before and after, the mesh, light, turning and zoom."""
-    shown = window().open(page_of_one)
-    picture = first = shown.press("3", "g").seen()
+    shown = opened(window, page_of_one)
+    picture = first = seen(shown, "3", "g")
     normals = normals_seen_by(CAMERA, torch.from_numpy(waves())[None].double())
     expected = 255 * render_for_viewing(normals)[0, 0].numpy()
     v, u = np.mgrid[6:36:3, 6:36:3]
@@ -123,7 +81,7 @@ def test_surface_is_the_results_own_in_every_light_and_from_every_side(window, p
     assert np.ptp(expected[v, u]) > 30
     assert np.abs(found - expected[v, u][..., None]).mean() < 3  # normals of vertices, of pixels
 
-    picture = shown.press("p").seen()
+    picture = seen(shown, "p")
     beside = picture[picture.shape[0] // 2, 5]
     assert np.abs(at(picture, 15.5, 45.5) - beside).max() < 40
     assert at(picture, 12, 30)[0] > 120  # the photo is red there
@@ -131,7 +89,7 @@ def test_surface_is_the_results_own_in_every_light_and_from_every_side(window, p
     assert at(picture, columns, rows).max() < 90
     shown.press("g")
 
-    before, both, after = (shown.press(key).seen() for key in "123")
+    before, both, after = (seen(shown, key) for key in "123")
     half = after.shape[1] // 2
     assert np.abs(before - after).mean() > 1
     assert np.abs(both[:, : half - 20] - before[:, : half - 20]).max() <= 1
@@ -147,14 +105,19 @@ def test_surface_is_the_results_own_in_every_light_and_from_every_side(window, p
 
     ball = shown.page.locator(".ball").bounding_box()
     shown.page.mouse.click(ball["x"] + 0.9 * ball["width"], ball["y"] + 0.5 * ball["height"])
-    lit = shown.seen()
+    lit = seen(shown)
     assert np.abs(lit - first).mean() > 1.5
     shown.page.locator("#stage").focus()
     for keys in (["ArrowLeft"] * 4, ["Shift+ArrowRight"] * 4, ["+"] * 3):
-        assert np.abs(shown.press(*keys).seen() - lit).mean() > 2
+        assert np.abs(seen(shown, *keys) - lit).mean() > 2
         shown.press("0")
-    assert np.abs(shown.drag((0.4, 0.5), (0.6, 0.5)).seen() - lit).mean() > 5
-    assert re.search(r"turned \d+\u00b0 to the right", shown.label())
+    stage, mouse = shown.page.locator("#stage").bounding_box(), shown.page.mouse
+    mouse.move(stage["x"] + 0.4 * stage["width"], stage["y"] + 0.5 * stage["height"])
+    mouse.down()
+    mouse.move(stage["x"] + 0.6 * stage["width"], stage["y"] + 0.5 * stage["height"], steps=3)
+    mouse.up()
+    assert np.abs(seen(shown) - lit).mean() > 5
+    assert re.search(r"turned \d+\u00b0 to the right", label(shown))
 
 
 def errors():
@@ -163,8 +126,8 @@ def errors():
 
 
 def test_errors_have_the_colours_of_the_legend(window, page_of_one):
-    shown = window().open(page_of_one)
-    picture = shown.press("3", "d").seen()
+    shown = opened(window, page_of_one)
+    picture = seen(shown, "3", "d")
     middle = float(np.nanmedian(waves()))
     columns = np.array([4, 16, 28])  # beyond, the error is larger than the mesh allows
     for u in columns:
@@ -179,17 +142,17 @@ def test_errors_have_the_colours_of_the_legend(window, page_of_one):
     assert shown.page.locator(".scale-title").inner_text() == "Expected error of the normal, degrees"
     ticks = shown.page.locator(".ticks span").all_inner_texts()
     assert ticks == ["\u2264 1", "2", "5", "10", "20", "\u2265 60"]
-    assert np.abs(shown.seen() - picture).mean() > 3
+    assert np.abs(seen(shown) - picture).mean() > 3
     shown.press("g")
     assert shown.page.locator(".scale").is_hidden()
 
 
 def test_results_are_chosen_by_list_strip_and_keys_and_names_are_text(window, page_of_two):
-    shown = window().open(page_of_two)
+    shown = opened(window, page_of_two)
     page = shown.page
     assert page.locator("#result option").all_inner_texts() == [SPITEFUL, "b"]
     assert page.locator(".facts dd").first.inner_text() == f"{SPITEFUL} x4"
-    assert SPITEFUL in shown.label()
+    assert SPITEFUL in label(shown)
     page.locator(".strip button").nth(1).click()
     page.wait_for_selector(".stage[data-shown='1']")
     assert page.locator(".sides").is_hidden()
@@ -205,8 +168,8 @@ def test_results_are_chosen_by_list_strip_and_keys_and_names_are_text(window, pa
     page.wait_for_selector(".stage[data-shown='1']")
 
 
-def test_browser_without_webgl_shows_pictures_and_says_why(browser, page_of_two):
-    shown = Window(browser)
+def test_browser_without_webgl_shows_pictures_and_says_why(window, page_of_two):
+    shown = window()
     shown.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     shown.page.goto(page_of_two)
     alert = shown.page.locator("[role=alert]")
@@ -219,5 +182,3 @@ def test_browser_without_webgl_shows_pictures_and_says_why(browser, page_of_two)
         f"{SPITEFUL}, before: the depth map as it came, as a grey surface lit from the upper left; holes are pink"
     )
     assert shown.page.locator("#stills h2").all_inner_texts() == [SPITEFUL, "b"]
-    shown.context.close()
-    assert shown.wrong == []
