@@ -230,6 +230,16 @@ def test_damaged_prediction_is_left_out_and_named(make_run, tmp_path):
     assert any("expected a prediction" in note for note in data["notes"])
 
 
+def test_result_whose_expected_errors_do_not_fit_is_shown_without_them(make_run, tmp_path):
+    results = load_results([make_run(tmp_path / "run", confident=True)])
+    path = tmp_path / "run" / "predictions" / "cube_no_texture.npz"
+    with np.load(path) as stored:
+        np.savez(path, **{**stored, "depth_error": stored["depth_error"][1:]})
+    _, data, scene = saved(tmp_path, results)
+    assert "expected" not in scene["surfaces"][1]
+    assert any("cube_no_texture" in note for note in data["notes"])
+
+
 def test_scene_without_truth_has_renderings_and_no_errors(make_run, tmp_path):
     [run] = load_results([make_run(tmp_path / "run")]).runs
     stored = dataclasses.replace(run.sample("cube_no_texture"), depth=None)

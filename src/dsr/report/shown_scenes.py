@@ -51,22 +51,31 @@ def stored_sample(view: View, notes: list[str]) -> DepthSample | None:
 
 
 def results_of(view: View, stored: DepthSample, notes: list[str]) -> list[Result]:
-    """Return the predictions that have the size of the scene; ``notes`` takes the others."""
-    found = []
+    """Return the predictions of the scene's size; ``notes`` takes others, and expected errors that do not fit."""
     size = (1, stored.camera.height, stored.camera.width)
+
+    def expect_size(run: Run, maps: Sequence[Tensor]) -> None:
+        for each in maps:
+            if tuple(each.shape) != size:
+                expected = f"expected maps of the photo's {size[1]} x {size[2]} pixels"
+                got = " x ".join(map(str, each.shape[1:]))
+                raise ValueError(f"{run.folder}: {view.scene}: {expected}, got {got}; not shown")
+
+    found = []
     for run in view.runs:
         try:
-            depth, errors = run.prediction(view.scene), run.expected_errors(view.scene)
+            depth, errors = run.prediction(view.scene), None
+            expect_size(run, [depth])
         except (ValueError, OSError) as error:
             notes.append(str(error))
             continue
-        maps = (depth, *(errors or ()))
-        if all(tuple(each.shape) == size for each in maps):
-            found.append(Result(run, depth.double(), errors))
-            continue
-        came = " and ".join(" x ".join(map(str, each.shape[1:])) for each in maps)
-        expected = f"expected maps of the photo's {size[1]} x {size[2]} pixels"
-        notes.append(f"{run.folder}: {view.scene}: {expected}, got {came}; not shown")
+        try:
+            errors = run.expected_errors(view.scene)
+            expect_size(run, errors or ())
+        except (ValueError, OSError) as error:
+            notes.append(str(error))
+            errors = None
+        found.append(Result(run, depth.double(), errors))
     return found
 
 
