@@ -98,7 +98,7 @@ def _search(root: Path, leave: Path | None) -> PairingResult:
     """Return the pairs in a folder or, if there are none, in the first subfolders that have some."""
     pairs, unpaired = list[Pair](), list[Path]()
     notes: dict[Assumption, None] = {}
-    folders = [root]
+    folders, asked = [root], set[Path]()
     while folders:
         folder = folders.pop(0)
         parts = folder.relative_to(root).parts
@@ -110,7 +110,8 @@ def _search(root: Path, leave: Path | None) -> PairingResult:
             pairs.append(pair if name == pair.name else replace(pair, name=name))
         unpaired += found.unpaired
         if found.pairs:
-            above = [each for each in folder.parents if each.is_relative_to(root)] if parts else []
+            above = [each for each in folder.parents if each.is_relative_to(root) and each not in asked]
+            asked.update(above)
             notes |= dict.fromkeys((*(note for each in reversed(above) for note in _alike(each)), *found.assumptions))
         elif len(parts) < _MAX_DEPTH:
             below = sorted((path for path in folder.iterdir() if path.is_dir()), key=natural_key)
