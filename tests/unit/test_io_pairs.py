@@ -37,6 +37,8 @@ LAYOUTS = {
                     "color/1700000000045000000.png", "depth/1700000000047000000.png"),
     "seconds": ("rgb/1305031102.175304.png", "depth/1305031102.160407.png", "rgb/1305031102.211214.png",
                 "depth/1305031102.226738.png"),
+    "a clock from 0": ("rgb/left_0000000000.png", "depth/tof_0000000000.png", "rgb/left_0000000005.png",
+                       "depth/tof_0000000005.png"),
 }  # fmt: skip
 
 

@@ -112,7 +112,7 @@ def match_names(photos: Iterable[Path], depths: Iterable[Path]) -> list[tuple[Pa
     partner = {path: by_key[key_of(path)].pop(0) for path in photos if by_key.get(key_of(path))}
     used = set(partner.values())
     left, alone = [path for path in photos if path not in partner], [path for path in depths if path not in used]
-    times = ([time_of(path) or math.nan for path in each] for each in (left, alone))
+    times = ([math.nan if (time := time_of(path)) is None else time for path in each] for each in (left, alone))
     for place, other in match_times(*times):
         partner[left[place]] = alone[other]
     return [(path, partner[path]) for path in photos if path in partner]
