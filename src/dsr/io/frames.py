@@ -10,7 +10,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, ParamSpec
 
 import cv2
 import numpy as np
@@ -29,6 +29,7 @@ SLACK = 0.002  # fractions count as equal within this: 127 of 255 is a half
 _ARRAYS = (".npy", ".npz", ".pfm", ".exr")
 CONFIDENCE_SUFFIXES = (*DEPTH_SUFFIXES, ".bmp")
 UPS = ("", "y", "z")  # axes of a capture's world that point up; "" where it does not say
+_Arguments = ParamSpec("_Arguments")
 
 
 class Source:
@@ -89,10 +90,10 @@ class Geometry(NamedTuple):
     apart: str = ""
 
 
-def stated(read: Callable[[], Geometry]) -> Geometry:
-    """Return what a capture states, or what is damaged of it: that ends nothing if cameras are given."""
+def stated(read: Callable[_Arguments, Geometry], *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> Geometry:
+    """Return what a reader finds stated, or what is damaged of it: that ends nothing if cameras are given."""
     try:
-        return read()
+        return read(*args, **kwargs)
     except ValueError as error:
         return Geometry(damage=str(error))
 
@@ -123,7 +124,7 @@ class CaptureFrame:
     def geometry_of(self, size: Size) -> Geometry:
         """Return cameras and pose for a photo of (height, width), of which some may be damaged."""
         geometry = self.geometry
-        return geometry if isinstance(geometry, Geometry) else stated(lambda: geometry(size))
+        return geometry if isinstance(geometry, Geometry) else stated(geometry, size)
 
     def record(self) -> Record:
         """Return what identifies the description of the camera."""

@@ -14,7 +14,6 @@ The n-th pose, by the first of the three numbers, is that of the n-th photo, by 
 
 from __future__ import annotations
 
-import functools
 import json
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,7 +23,7 @@ import numpy as np
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.io.frames import CaptureFrame, Geometry
+from dsr.io.frames import CaptureFrame, Geometry, stated
 from dsr.io.pairs import Pair, PairingResult
 from dsr.io.photos import write_png
 from dsr.io.scene_files import RGBD, Frame, one_camera, to_millimetres
@@ -50,7 +49,7 @@ def add_trajectory(folder: Path, found: PairingResult) -> PairingResult:
         return replace(found, assumptions=(*found.assumptions, Assumption(text)))
     pairs: list[Pair] = []
     for rank, (pair, rows) in enumerate(zip(found.pairs, entries, strict=True)):
-        geometry = functools.partial(_geometry, f"{path}: pose {rank}", rows)
+        geometry = stated(_geometry, f"{path}: pose {rank}", rows)
         pairs.append(replace(pair, capture=CaptureFrame(_APP, geometry, path, "\n".join(rows).encode())))
     text = f"poses: {path.relative_to(folder).as_posix()} of {_APP}, one for each photo"
     return replace(found, pairs=tuple(pairs), assumptions=(*found.assumptions, Assumption(text)))
@@ -70,7 +69,7 @@ def _read_entries(path: Path) -> list[_Rows]:
     return [tuple(lines[5 * place + 1 : 5 * place + 5]) for place in order]
 
 
-def _geometry(place: str, rows: _Rows, _: tuple[int, int]) -> Geometry:
+def _geometry(place: str, rows: _Rows) -> Geometry:
     """Return the pose of a frame; its camera is read from the file beside the pictures."""
     values = [numbers_in(row.split()) for row in rows]
     if [len(row) for row in values] != [4] * 4:

@@ -78,7 +78,7 @@ def _find_arkitscenes(folder: Path) -> PairingResult | None:
     for stem in both:
         intrinsics, motion = find_intrinsics(folder / f"{kind}_intrinsics", stem), _nearest(motions, stem)
         described = (b"" if intrinsics is None else read_limited(intrinsics, _LARGEST_PINCAM)) + repr(motion).encode()
-        geometry = _arkitscenes_geometry(f"{trajectory}: frame {stem}", intrinsics, motion)
+        geometry = stated(_arkitscenes_geometry, f"{trajectory}: frame {stem}", intrinsics, motion)
         time = _time(stem) if math.isfinite(_time(stem)) else None
         frame = CaptureFrame(_ARKITSCENES, geometry, intrinsics or trajectory, described)
         path = folder / "confidence" / f"{stem}.png"
@@ -123,27 +123,23 @@ def find_intrinsics(folder: Path, stem: str) -> Path | None:
 
 def _arkitscenes_geometry(place: str, intrinsics: Path | None, motion: _Motion | None) -> Geometry:
     """Return camera and pose of a frame."""
+    camera = None
+    if intrinsics is not None:
+        width, height, *numbers = read_numbers(intrinsics, 6).tolist()
+        if not (width >= 1 and height >= 1 and float(width).is_integer() and float(height).is_integer()):
+            raise ValueError(f"{intrinsics}: expected a width and a height in pixels, got {width:g} and {height:g}")
+        camera = intrinsics_camera(str(intrinsics), (int(height), int(width)), numbers)
+    if motion is None:
+        note = Assumption("no pose: lowres_wide.traj has none within 10 ms of the frame")
+        return Geometry(camera, None, (note,), up="z")
+    if not np.isfinite(motion).all():
+        raise ValueError(f"{place}: expected a rigid pose, got {' '.join(f'{value:g}' for value in motion)}")
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a third of a second that frames without poses save
 
-    def geometry() -> Geometry:
-        camera = None
-        if intrinsics is not None:
-            width, height, *numbers = read_numbers(intrinsics, 6).tolist()
-            if not (width >= 1 and height >= 1 and float(width).is_integer() and float(height).is_integer()):
-                raise ValueError(f"{intrinsics}: expected a width and a height in pixels, got {width:g} and {height:g}")
-            camera = intrinsics_camera(str(intrinsics), (int(height), int(width)), numbers)
-        if motion is None:
-            note = Assumption("no pose: lowres_wide.traj has none within 10 ms of the frame")
-            return Geometry(camera, None, (note,), up="z")
-        if not np.isfinite(motion).all():
-            raise ValueError(f"{place}: expected a rigid pose, got {' '.join(f'{value:g}' for value in motion)}")
-        from scipy.spatial.transform import Rotation  # noqa: PLC0415 - a third of a second that frames without poses save
-
-        to_camera = np.eye(4)
-        to_camera[:3, :3] = Rotation.from_rotvec(motion[:3]).as_matrix()
-        to_camera[:3, 3] = motion[3:]
-        return Geometry(camera, check_pose(place, np.linalg.inv(to_camera)), up="z")
-
-    return stated(geometry)
+    to_camera = np.eye(4)
+    to_camera[:3, :3] = Rotation.from_rotvec(motion[:3]).as_matrix()
+    to_camera[:3, 3] = motion[3:]
+    return Geometry(camera, check_pose(place, np.linalg.inv(to_camera)), up="z")
 
 
 class _PolycamCamera(BaseModel, strict=True):
@@ -186,7 +182,8 @@ def _find_polycam(folder: Path) -> PairingResult | None:
         if photo is None or camera is None:
             unpaired.append(depth)
             continue
-        frame = CaptureFrame(_POLYCAM, _polycam_geometry(camera), camera, read_limited(camera, _LARGEST_JSON))
+        geometry = stated(_polycam_geometry, camera)
+        frame = CaptureFrame(_POLYCAM, geometry, camera, read_limited(camera, _LARGEST_JSON))
         confidence = frames / "confidence" / depth.name
         known = ConfidenceMap(confidence, 255) if confidence.is_file() else None
         pairs.append(Pair(depth.stem, photo, depth, unit=1e-3, capture=frame, confidence=known))
@@ -199,16 +196,11 @@ def _find_polycam(folder: Path) -> PairingResult | None:
 
 def _polycam_geometry(path: Path) -> Geometry:
     """Return camera and pose of a frame."""
-
-    def geometry() -> Geometry:
-        stored = parse_model(_PolycamCamera, read_text(path, _LARGEST_JSON), path, f"expected {_POLYCAM}'s camera; ")
-        numbers = stored.fx, stored.fy, stored.cx, stored.cy
-        camera = intrinsics_camera(str(path), (stored.height, stored.width), numbers)
-        rows = [[getattr(stored, f"t_{row}{column}") for column in range(4)] for row in range(3)]
-        pose = check_pose(str(path), np.array([*rows, [0, 0, 0, 1]], dtype=np.float64), opengl=True)
-        return Geometry(camera, pose, up="y")
-
-    return stated(geometry)
+    stored = parse_model(_PolycamCamera, read_text(path, _LARGEST_JSON), path, f"expected {_POLYCAM}'s camera; ")
+    camera = intrinsics_camera(str(path), (stored.height, stored.width), (stored.fx, stored.fy, stored.cx, stored.cy))
+    rows = [[getattr(stored, f"t_{row}{column}") for column in range(4)] for row in range(3)]
+    pose = check_pose(str(path), np.array([*rows, [0, 0, 0, 1]], dtype=np.float64), opengl=True)
+    return Geometry(camera, pose, up="y")
 
 
 class _ScannerFrame(BaseModel, strict=True):

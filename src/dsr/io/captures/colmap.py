@@ -129,7 +129,7 @@ def _read_model(file: Path) -> _Sparse:
 def _frame(file: Path, image: _Image, camera: _Camera) -> CaptureFrame:
     """Return the frame of an image, with camera and pose from the model."""
     placed = (image.quaternion, image.translation, camera)
-    geometry = stated(lambda: _geometry(f"{file}: image {image.name!r:.80}", *placed))
+    geometry = stated(_geometry, f"{file}: image {image.name!r:.80}", *placed)
     return CaptureFrame(_APP, geometry, file, repr(placed).encode())
 
 

@@ -152,7 +152,7 @@ def _read(path: Path) -> PairingResult:
         attached = [bytes(each.data) for each in container.streams.attachments if each.name == "calibration.json"]
     if not attached:
         raise ValueError(f"{path}: expected a recording with the attachment calibration.json, there is none")
-    geometry = stated(lambda: _geometry(f"{path}: calibration.json", attached[0], *sizes))
+    geometry = stated(_geometry, f"{path}: calibration.json", attached[0], *sizes)
     found = pair_by_time(photos, depths, CaptureFrame(_APP, geometry, path, attached[0], apart=True), 1e-3)
     note = describe_capture(f"a recording of {_APP}", "millimetres", found.pairs, poses=False)
     return replace(found, assumptions=(note,))

@@ -89,7 +89,7 @@ def read_sens(path: Path) -> PairingResult:
                 raise ValueError(f"{path}: expected {header.frames} frames, it is damaged or ends in frame {number}")
             photo = Section(path, f"color/{number}", start, lengths[0], functools.partial(_photo, header))
             depth = Section(path, f"depth/{number}", start + lengths[0], lengths[1], functools.partial(_depth, header))
-            geometry = _geometry(f"{path}: frame {number}", header, values[:16])
+            geometry = stated(_geometry, f"{path}: frame {number}", header, values[:16])
             about = content[:64] + repr(header).encode()
             frame = CaptureFrame("ScanNet", geometry, path, about, photo, depth)
             files, time = (path / photo.name, path / depth.name), 1e-6 * values[16]
@@ -145,14 +145,10 @@ def _depth(header: _Sens, content: bytes) -> np.ndarray:
 
 def _geometry(place: str, header: _Sens, values: tuple[float, ...]) -> Geometry:
     """Return camera and pose of a frame."""
-
-    def geometry() -> Geometry:
-        camera, matrix = intrinsics_camera(place, header.photo, header.intrinsics), np.reshape(values, (4, 4))
-        if not np.isfinite(matrix).all():
-            return Geometry(camera, None, (_NO_POSE,))
-        return Geometry(camera, as_rigid(matrix, place))
-
-    return stated(geometry)
+    camera, matrix = intrinsics_camera(place, header.photo, header.intrinsics), np.reshape(values, (4, 4))
+    if not np.isfinite(matrix).all():
+        return Geometry(camera, None, (_NO_POSE,))
+    return Geometry(camera, as_rigid(matrix, place))
 
 
 _Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]
