@@ -63,9 +63,9 @@ def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) ->
     if choice.file is not None:
         return _fit_to_photo(choice.file, read_any_camera(choice.file), size, size_lr, photo)
     if choice.intrinsics is not None:
-        return camera_only(Camera(width, height, *choice.intrinsics)), []
+        return CameraFile(Camera(width, height, *choice.intrinsics)), []
     if choice.fov is not None:
-        return camera_only(Camera.from_fov(choice.fov, width, height)), []
+        return CameraFile(Camera.from_fov(choice.fov, width, height)), []
     equivalent = focal_in_exif(photo)
     if equivalent is not None:
         focal = equivalent / _FILM_DIAGONAL * math.hypot(width, height)
@@ -73,10 +73,10 @@ def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) ->
             "camera: focal length from the photo's EXIF data, principal point in the middle",
             f"{equivalent:g} mm for 35 mm film = {focal:.5g} pixels",
         )
-        return camera_only(Camera.centred(width, height, focal)), [assumption]
+        return CameraFile(Camera.centred(width, height, focal)), [assumption]
     camera = Camera.from_fov(ASSUMED_FOV, width, height)
     text = f"camera: none given, {ASSUMED_FOV:g} degrees of horizontal view assumed (--camera, --fov or --intrinsics)"
-    return camera_only(camera), [Assumption(text, f"{camera.fx:.5g} pixels")]
+    return CameraFile(camera), [Assumption(text, f"{camera.fx:.5g} pixels")]
 
 
 def read_any_camera(path: Path) -> CameraFile | np.ndarray:
@@ -187,11 +187,6 @@ class _Open3d(BaseModel, strict=True):
     intrinsic_matrix: Annotated[list[float], Field(min_length=9, max_length=9)]
 
 
-def camera_only(camera: Camera) -> CameraFile:
-    """Return a camera file that says nothing about depth."""
-    return CameraFile(camera)
-
-
 def _fit_to_photo(
     path: Path, content: CameraFile | np.ndarray, size: Size, size_lr: Size, photo: Path
 ) -> tuple[CameraFile, list[Assumption]]:
@@ -233,11 +228,11 @@ def _camera_of_matrix(path: Path, matrix: np.ndarray, size: Size, size_lr: Size)
     cx, cy = matrix[0, 2], matrix[1, 2]
     if min(cx, cy) > 0 and max(cx, cy) < 1 and max(matrix[0, 0], matrix[1, 1]) < _FOCAL_OF_ONE:  # of a 1 x 1 picture
         camera = Camera(1, 1, matrix[0, 0], matrix[1, 1], cx - 0.5, cy - 0.5)
-        return camera_only(camera.rescale(size[1], size[0])), []
+        return CameraFile(camera.rescale(size[1], size[0])), []
     for name, (height, width) in (("photo", size), ("depth map", size_lr)):
         if may_be_of(cx, cy, width, height):
             camera = Camera(width, height, matrix[0, 0], matrix[1, 1], cx, cy)
-            return camera_only(camera), [Assumption(f"camera: the matrix is read in pixels of the {name}")]
+            return CameraFile(camera), [Assumption(f"camera: the matrix is read in pixels of the {name}")]
     raise ValueError(
         f"{path}: expected a principal point near the middle of the photo, {size[1]} x {size[0]} pixels (width x "
         f"height), or of the depth map, {size_lr[1]} x {size_lr[0]}; got {cx:g}, {cy:g}"
@@ -267,7 +262,7 @@ def _of_yaml(path: Path, text: str) -> CameraFile:
         raise ValueError(f"{path}: expected a camera without lens distortion, got distortion_coefficients")
     fx, _, cx, _, fy, cy, *_ = lists["camera_matrix"]
     size = int(sizes["height"]), int(sizes["width"])
-    return camera_only(intrinsics_camera(str(path), size, (fx, fy, cx, cy)))
+    return CameraFile(intrinsics_camera(str(path), size, (fx, fy, cx, cy)))
 
 
 def read_rig(files: RigFiles, size_lr: Size, baseline: float | None) -> Rig:

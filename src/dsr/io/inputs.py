@@ -18,7 +18,6 @@ from dsr.geometry.plausible import expect_possible
 from dsr.geometry.resampling import registered_camera, warp_depth
 from dsr.io.cameras import (
     CameraFile,
-    camera_only,
     doubt_camera,
     doubt_depth,
     find_camera,
@@ -184,7 +183,7 @@ def read_map(path: Path, reading: Reading, camera: Camera | None = None) -> tupl
     content = None if pair.camera is None else read_any_camera(pair.camera)
     own = content if isinstance(content, CameraFile) else None
     if own is None:
-        own = camera_only(ICL_CAMERA if _is_icl(pair) else Camera.from_fov(ASSUMED_FOV, size[1], size[0]))
+        own = CameraFile(ICL_CAMERA if _is_icl(pair) else Camera.from_fov(ASSUMED_FOV, size[1], size[0]))
     of_depth = scale_to_depth(str(pair.camera or path) if camera is None else "camera", camera or own.camera, size)
     of_depth = replace(of_depth, baseline=reading.baseline or of_depth.baseline)
     values = _interpret(pair, reading, own, stored, FolderUnits(), of_depth)
@@ -357,10 +356,10 @@ def _camera(
         return found
     if pair.camera is None and _is_icl(pair) and size == size_lr:
         notes.append(Assumption("camera: that of ICL-NUIM"))
-        return camera_only(ICL_CAMERA)
+        return CameraFile(ICL_CAMERA)
     notes += geometry.assumptions
     if pair.capture is not None and geometry.camera is not None:
-        found, more = scale_to_photo(pair.capture.description, camera_only(geometry.camera), size)
+        found, more = scale_to_photo(pair.capture.description, CameraFile(geometry.camera), size)
     elif pair.camera is None:
         found, more = find_camera(reading.camera, pair.rgb, size, size_lr)
     else:
