@@ -20,8 +20,8 @@ from dsr.geometry.camera import ASSUMED_FOV, Camera, RangeType, expect_intrinsic
 from dsr.geometry.plausible import implausible_distance, judge_camera, may_be_of, plausible_baseline
 from dsr.geometry.resampling import registered_camera, warp_depth
 from dsr.io.frames import Rig
-from dsr.io.images import Pixels, pixels_in_header
-from dsr.io.photos import Size, focal_in_exif, orientation_of, same_aspect
+from dsr.io.images import Pixels, Size, pixels_in_header
+from dsr.io.photos import focal_in_exif, orientation_of, same_aspect
 from dsr.io.reading import CameraChoice, RigFiles
 from dsr.io.trajectories import intrinsics_camera, read_transform
 from dsr.notes import Assumption

@@ -18,11 +18,10 @@ import numpy as np
 from dsr.geometry.camera import Camera, Lens
 from dsr.geometry.poses import Matrix
 from dsr.io.depth_files import DEPTH_SUFFIXES, read_array_file
-from dsr.io.images import read_pixels
+from dsr.io.images import Size, read_pixels
 from dsr.notes import Assumption
 from dsr.utils.guards import naming, pixels_beside
 
-Size = tuple[int, int]
 Record = dict[str, str | int]  # identifies an input in info.json: name, SHA-256, and a frame's number if it has one
 HIGHEST_LEVEL = 2  # of ARKit's confidence: 0 (low), 1 (medium) and 2 (high)
 SLACK = 0.002  # fractions count as equal within this: 127 of 255 is a half

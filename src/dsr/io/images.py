@@ -25,6 +25,7 @@ from dsr.utils.guards import (
 )
 from dsr.utils.validation import Whole
 
+Size = tuple[int, int]  # height and width in pixels
 MAP_SUFFIXES = (".npy", ".png", ".tiff", ".tif", ".pfm")
 Pixels = Annotated[Whole, Field(ge=1, le=1e12)]  # a size in a camera file
 _BITS, _DARK = (8, 10, 12, 14, 16), 64  # that a photo of 16 bits may use; its values of 8 bits are below if not all

@@ -29,8 +29,8 @@ from dsr.io.cameras import (
 )
 from dsr.io.depth_files import ICL_CAMERA, ICL_SUFFIX, read_depth_file
 from dsr.io.encoding import Encoding, decode, expect_known, find_holes, turn_back_bits
-from dsr.io.frames import SLACK, Geometry, Rig, Size
-from dsr.io.images import pixels_in_header, read_mask
+from dsr.io.frames import SLACK, Geometry, Rig
+from dsr.io.images import Size, pixels_in_header, read_mask
 from dsr.io.pairs import Pair, find_camera_file, role_of_words, words_of
 from dsr.io.photos import model_in_exif, read_photo, same_aspect
 from dsr.io.reading import SUNRGBD_BITS, CameraChoice, Reading

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from dsr.io.images import read_colours
+from dsr.io.images import Size, read_colours
 from dsr.notes import Assumption
 from dsr.utils.files import replacing
 from dsr.utils.guards import MOST_FILE, expect_pixels, read_limited, refusing
@@ -38,9 +38,6 @@ _IN_HEIC = {turn: orientation for orientation, turn in _TURNS.items()}
 _LEVEL = 6  # of the compression of PNG files
 # What pillow-heif raises of damaged files.
 _DAMAGED = (ValueError, RuntimeError, SyntaxError, EOFError, OSError, IndexError, MemoryError)
-
-Size = tuple[int, int]
-"""Height and width in pixels."""
 
 
 def _turn(pixels: np.ndarray, orientation: int) -> np.ndarray:

@@ -20,6 +20,7 @@ from dsr.utils.guards import naming, numbers_in, parse_json, read_text, refusing
 _LARGEST_FILE = 256 << 20
 _MAX_GAP = 0.02  # seconds between a frame and its pose
 _MOST_BETWEEN = 10.0  # metres between the two cameras of a rig; more is taken for millimetres
+NO_POSE = Assumption("no pose: the capture has none of the frame")
 USUAL_SIZE = (1440, 1920)  # height and width of iPhones' photos, for photos that were made smaller
 _ARKIT_TO_DSR = np.diag([1.0, -1.0, -1.0, 1.0])  # ARKit's and OpenGL's camera looks along -z with y up; dsr's along z
 

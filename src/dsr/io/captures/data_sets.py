@@ -62,7 +62,7 @@ from dsr.io.pairs import (
 )
 from dsr.io.photos import same_aspect
 from dsr.io.reading import SUNRGBD_BITS
-from dsr.io.trajectories import describe_capture, fitting_camera, read_poses
+from dsr.io.trajectories import NO_POSE, describe_capture, fitting_camera, read_poses
 from dsr.io.units import TURNED_BACK
 from dsr.notes import Assumption
 from dsr.utils.guards import natural_key, read_limited
@@ -72,7 +72,6 @@ _KINECT = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
 _NICE_SLAM, _REPLICA_UNIT = Camera(1200, 680, 600.0, 600.0, 599.5, 339.5), 1 / 6553.5
 _SCANNET_SIZE = (968, 1296)
 _PARAMS = ("cam_params.json", "camera.json")
-_NO_POSE = Assumption("no pose: the capture has none of the frame")
 # Returns the camera of a photo of (height, width), and what was assumed for it.
 _CameraOf = Callable[[Size], tuple[Camera | None, str]]
 
@@ -145,7 +144,7 @@ def _find_replica(folder: Path) -> PairingResult | None:
     pairs = []
     for number in both:
         pose = poses[ranks[number]] if ranks[number] < len(poses) else None
-        known = Geometry(None, pose, (_NO_POSE,) if pose is None else ())
+        known = Geometry(None, pose, (NO_POSE,) if pose is None else ())
         described = repr(None if pose is None else pose.tolist()).encode()
         frame = CaptureFrame("Replica", known if params else functools.partial(_replica, known), trajectory, described)
         pairs.append(Pair(photos[number].stem, photos[number], depths[number], params, unit=unit, capture=frame))
@@ -168,7 +167,7 @@ def _geometry(path: Path | None, camera: _CameraOf | None, size: Size) -> Geomet
     notes = (Assumption(text),) if text else ()
     matrix = np.full((4, 4), np.nan) if path is None else read_numbers(path, 16).reshape(4, 4)
     if not np.isfinite(matrix).all():
-        return Geometry(found, None, (*notes, _NO_POSE))
+        return Geometry(found, None, (*notes, NO_POSE))
     return Geometry(found, as_rigid(matrix, str(path)), notes)
 
 

@@ -43,8 +43,7 @@ from dsr.io.captures.contract import LIDAR, Capture
 from dsr.io.captures.stray import VideoFrame, check_count
 from dsr.io.frames import CaptureFrame, Geometry, Size, stated
 from dsr.io.pairs import Pair, PairingResult, numbered_files
-from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera, intrinsics_camera
-from dsr.notes import Assumption
+from dsr.io.trajectories import NO_POSE, USUAL_SIZE, describe_capture, fitting_camera, intrinsics_camera
 from dsr.utils.guards import opened, read_text, refusing
 from dsr.utils.validation import describe
 from dsr.utils.versions import how_to_install
@@ -52,7 +51,6 @@ from dsr.utils.versions import how_to_install
 _BEGINNING, _HEADER, _FRAME = struct.Struct("<IQ"), struct.Struct("<64f2i4IfQ"), struct.Struct("<16f4Q")
 _VERSION = 4
 _LONGEST_NAME, _LARGEST_SIDE, _MOST_FRAMES = 1 << 12, 1 << 14, 1 << 16
-_NO_POSE = Assumption("no pose: the capture has none of the frame")
 
 _JSON, _LARGEST_JSON = "pose_intrinsic_imu.json", 1 << 28
 _VIDEOS = ("rgb.mkv", "rgb.mp4")
@@ -147,7 +145,7 @@ def _geometry(place: str, header: _Sens, values: tuple[float, ...]) -> Geometry:
     """Return camera and pose of a frame."""
     camera, matrix = intrinsics_camera(place, header.photo, header.intrinsics), np.reshape(values, (4, 4))
     if not np.isfinite(matrix).all():
-        return Geometry(camera, None, (_NO_POSE,))
+        return Geometry(camera, None, (NO_POSE,))
     return Geometry(camera, as_rigid(matrix, place))
 
 
@@ -233,7 +231,7 @@ def _map(content: bytes) -> np.ndarray:
 
 def _iphone_geometry(place: str, entry: _Entry, size: Size) -> Geometry:
     """Return camera and pose of a frame."""
-    camera, notes = None, [] if entry.aligned_pose else [_NO_POSE]
+    camera, notes = None, [] if entry.aligned_pose else [NO_POSE]
     if entry.intrinsic is not None:
         (fx, _, cx), (_, fy, cy), _ = entry.intrinsic
         camera = fitting_camera(place, (size, USUAL_SIZE), (fx, fy, cx, cy))
