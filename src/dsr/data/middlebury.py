@@ -40,7 +40,7 @@ from dsr.data.scene_source import WITHOUT_OFFSET, SceneSelection
 from dsr.geometry.camera import Camera, from_range
 from dsr.io.images import read_levels, read_map
 from dsr.sample import Scene
-from dsr.utils.guards import naming, natural_key, numbers_in, read_text
+from dsr.utils.guards import expect_one_of, naming, natural_key, numbers_in, read_text
 
 _MATRIX = re.compile(r"\[\s*(\S+)\s+0\s+(\S+)\s*;\s*0\s+(\S+)\s+(\S+)\s*;\s*0\s+0\s+1\s*\]")
 _FULL_HEIGHT, _FULL_FOCAL, _BASELINE = 1110, 3740.0, 0.16
@@ -218,8 +218,7 @@ class MiddleburyLevels(PreparedDataset):
         fill: Sequence[str] = (),
         smooth: bool = True,
     ) -> None:
-        if year not in SCENES:
-            raise ValueError(f"year: expected one of {', '.join(map(str, SCENES))}, got {year}")
+        expect_one_of("year", year, SCENES)
         name = f"middlebury{year}"
         found = records_levels(Path(root).expanduser(), name, year, smooth=smooth)
         preparation = Preparation(size, crop, fill=tuple(fill))

@@ -229,10 +229,10 @@ def naming(place: object) -> Iterator[None]:
         raise ValueError(f"{place}: {error}") from error
 
 
-def expect_one_of(key: str, value: object, known: Collection[str | None]) -> None:
+def expect_one_of(key: str, value: object, known: Collection[object]) -> None:
     """Raise a ValueError if a key's value is not one of those that are known."""
     if value not in known:
-        names = ", ".join("null" if each is None else each for each in known)
+        names = ", ".join("null" if each is None else str(each) for each in known)
         raise ValueError(f"{key}: expected one of {names}, got {value!r}")
 
 
