@@ -46,6 +46,8 @@ def find_scenes(folder: Path) -> Iterator[tuple[str, Loader]]:
 def _detected() -> Iterator[tuple[Callable[[Path], Frames], Callable[..., Scene], str]]:
     """Yield what the modules of data sets have in ``DETECTED``."""
     for module in pkgutil.iter_modules(dsr.data.__path__, "dsr.data."):
+        if module.name == "dsr.data.rendered":  # has no files, and its renderer takes half a second to import
+            continue
         yield from getattr(importlib.import_module(module.name), "DETECTED", ())
 
 
