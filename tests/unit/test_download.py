@@ -438,7 +438,10 @@ def test_files_from_elsewhere_are_recorded_as_they_are(server, tmp_path):
     (tmp_path / "set/a.png").write_bytes(PNG)
     assert verified(collection(item), tmp_path) == ([], [f"{tmp_path}/checksums.json: recorded as found: set/a.png"])
     (tmp_path / "set/b.png").write_bytes(PNG)
-    assert fetched(picture(server, name="b.png"), tmp_path) == []
+    (tmp_path / "set/c.png").write_bytes(PNG)
+    items, watcher = [picture(server, name=f"{name}.png") for name in "bca"], Watcher()
+    assert get(items, tmp_path, watcher) == []
+    assert watcher.lines == [f"{tmp_path}/checksums.json: recorded as found: set/{name}.png" for name in "bc"]
     assert server.log == []
     assert Checksums(tmp_path)["set/b.png"].sha256 == sha256(PNG)
 

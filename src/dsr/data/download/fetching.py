@@ -115,11 +115,12 @@ class Checksums(dict[str, Entry]):
 
     def record_found(self, progress: Progress) -> None:
         """Record what was found, and report it; the directory may be one to read from only."""
-        names = list(self._found)
+        found, self._found = self._found, {}
+        names = list(found)
         few = ", ".join(names) if len(names) < 4 else f"{names[0]}, {names[1]} and {len(names) - 2} more"
         try:
             if names:
-                self.record(self._found)
+                self.record(found)
                 progress.say(f"{self.path}: recorded as found: {few}")
         except OSError as error:
             progress.say(f"{self.path}: not written: {error}")
