@@ -63,8 +63,8 @@ def _read(path: Path) -> PairingResult:
     """Return the pair of a HEIC file."""
     if not _has_depth(path):
         raise ValueError(f"{path}: expected a HEIC photo with a depth map, as of portrait mode; there is none")
-    sources = _HeicImage(path, "photo"), _HeicImage(path, "depth")
-    frame = CaptureFrame(_APP, functools.partial(_geometry, path), path, _depth_xmp(path), *sources)
+    sources, xmp = (_HeicImage(path, "photo"), _HeicImage(path, "depth")), _depth_xmp(path)
+    frame = CaptureFrame(_APP, functools.partial(_geometry, path, xmp), path, xmp, *sources)
     pair = Pair(path.stem, path, path / "depth", unit=1.0, capture=frame)
     return PairingResult((pair,), (Assumption("HEIC photos with depth maps of their own"),))
 
@@ -100,9 +100,9 @@ def _depth_xmp(path: Path) -> bytes:
     return content[first:end] if place >= 0 and first >= 0 and end - first <= MOST_TEXT and end >= 0 else b""
 
 
-def _geometry(path: Path, size: Size) -> Geometry:
+def _geometry(path: Path, xmp: bytes, size: Size) -> Geometry:
     """Return the camera of a photo of (height, width)."""
-    text = _depth_xmp(path).decode(errors="replace")
+    text = xmp.decode(errors="replace")
     accuracy = re.search(r"depthData:Accuracy\W{1,3}(\w+)", text)
     notes = []
     if accuracy is None or accuracy[1] != "absolute":
