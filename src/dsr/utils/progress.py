@@ -50,9 +50,6 @@ class Progress:
         """
         yield from items
 
-    def stage(self, name: str) -> None:
-        """Say that the item that is being worked on begins a stage."""
-
 
 SILENT = Progress()
 

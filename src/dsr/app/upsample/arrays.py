@@ -77,7 +77,7 @@ def is_batch(rgb: Any, depth: Any) -> bool:
 
 
 def pictures_of(rgb: Any, depth: Any, camera: Any, mask: Any) -> Iterator[dict[str, Any]]:
-    """Yield the arguments of each picture of a batch, in which one camera is that of all; a ValueError for a lack."""
+    """Yield the arguments of each picture of a batch; one camera is that of all. Unequal numbers are a ValueError."""
     given = {"rgb": rgb, "depth": depth, "camera": camera, "mask": mask}
     several = {"rgb": rgb, "depth": depth}
     several |= {"camera": camera} if isinstance(camera, list | tuple) else {}

@@ -84,7 +84,6 @@ class FrameWork:
             tell(warnings)
             tell(f"{pair.name}: complete already, in {folder.path}")
             return Done(pair, folder.path, "complete already", bytes_of(folder.path, folder.earlier["files"]))
-        progress.stage("reading")
         begun = time.perf_counter()
         picture = self._read(pair)
         picture = replace(picture, assumptions=(*picture.assumptions, *self._frames.warnings.get(pair.name, ())))
@@ -98,7 +97,6 @@ class FrameWork:
             tell(f"{pair.name}: {planned.text} -> {folder.path}")
             return Done(pair, folder.path, "to do")
         folder.expect_free(files_of(pair, request.reading).values())
-        progress.stage("upsampling")
         read = time.perf_counter()
         kept = folder.surface(picture.camera, errors=any(part.errors for part in wanted.of_frame))
         if kept is None:
@@ -109,7 +107,6 @@ class FrameWork:
             surface = surface.without_dubious(wanted.max_error / 100) if wanted.certain else surface
         else:
             surface = kept._replace(filled=find_filled(kept.depth, picture.depth_lr))
-        progress.stage("writing")
         result = Result(picture, surface, planned, wanted, readable(pair.name))
         seconds = {"reading": read - begun, "upsampling": time.perf_counter() - read}
         stored = folder.store(result, seconds, reused=kept is not None)

@@ -21,7 +21,8 @@ from dsr.notes import LIMITS, Assumption
 class FrameSequence:
     """The frames of each folder of depth maps in order, with the poses of a file, or those that the frames have.
 
-    A number of neighbours votes on each frame's depth. A file that is damaged, or does not fit, is a ValueError.
+    Up to ``neighbours`` other frames vote on each one's depth. A file that is damaged, or does not fit, is a
+    ValueError.
     """
 
     def __init__(

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 INFO = "info.json"
 EXPORTS = "exports.json"  # the record of exports, in the folder of the results
-_OPTIONAL: Mapping[str, Any] = {  # entries of ``info.json`` that a run that is not complete has not
+_OPTIONAL: Mapping[str, Any] = {  # entries that ``info.json`` may lack, as while a run is not complete
     "noise": None,
     "shares": {},
     "seconds": {},
