@@ -5,7 +5,7 @@
 # make fuzz  10,000 damaged, foreign and malicious files for every reader (ARGS="--cases 1000 --seed 1")
 # make chaos commands that are killed and run at once (ARGS="--kills 100 --seed 0")
 # make mistakes  inputs that can be computed with and are wrong: which are told (ARGS="--cases 500 --seed 0")
-# make benchmark  how many times as fast as a plain way dsr does what it does (ARGS="--json before.json")
+# make benchmark  speed ratios: dsr against plain implementations (ARGS="--json before.json")
 # make dist  what a release consists of, built and checked, in dist
 # make docs  the documentation as a site in outputs/site
 # All of them set everything up in .venv first; they need Python >= 3.11 and nothing else.

@@ -60,9 +60,18 @@ from dsr.utils.options import add_options, build
 
 ROOT = Path(__file__).resolve().parents[1]
 
+FOLDERS = (
+    "ddrnet",
+    "icl_nuim",
+    "middlebury2005",
+    "middlebury2006",
+    "middlebury2014",
+    "rgbdd_real",
+    "sunrgbd",
+    "tartanair",
+)
 DATA_SETS = (
-    *(f"real/{name}" for name in ("ddrnet", "icl_nuim", "middlebury2005", "middlebury2006", "middlebury2014")),
-    *(f"real/{name}" for name in ("rgbdd_real", "sunrgbd", "tartanair")),
+    *(f"real/{name}" for name in FOLDERS),
     *("scenes", "modern/Lu", "modern/Middlebury", "modern/NYU", "modern/RGBDD"),
 )  # Folders that dsr finds scenes in by itself
 LIDAR_FOCAL = 1440.0  # Pixels of a phone's photo of 1920 x 1440, which comes without a camera
@@ -582,16 +591,6 @@ def encodings(words: Sequence[str]) -> None:
             print(f"| {name} | " + " | ".join(str(counts[each]) for each in ANSWERS) + " |", flush=True)
 
 
-FOLDERS = (
-    "ddrnet",
-    "icl_nuim",
-    "middlebury2005",
-    "middlebury2006",
-    "middlebury2014",
-    "rgbdd_real",
-    "sunrgbd",
-    "tartanair",
-)
 SENSORS = Everything(
     noises={"white": 1, "correlated": 1, "structured": 1, "flight": 1, "lidar": 1, "stereo": 1},
     holes={"none": 2, "blobs": 1, "shadows": 1, "steps": 1, "dark": 1, "pixels": 1},

@@ -333,6 +333,16 @@ def test_scene_of_one_method_alone_is_left_out_and_incomplete_ones_are_noted(tmp
     assert any("without DIP" in note for note in built.notes)
 
 
+def test_scene_with_fewer_than_two_predictions_that_can_be_read_is_left_out_with_their_files(tmp_path, runs):
+    damaged = [runs / f"folder_of_{method}" / "predictions" / "cube_no_texture.npz" for method in ("msg_v", "dip")]
+    for path in damaged:
+        path.write_bytes(b"no prediction")
+    built = build_study(load_results([runs]), tmp_path / "study")
+    assert [trial.scene for trial in built.key.trials.values()] == ["<_script><b>statue"]
+    [note] = [note for note in built.notes if note.startswith("left out")]
+    assert all(str(path) in note for path in damaged)
+
+
 @pytest.mark.parametrize(
     ("choice", "message"),
     [

@@ -35,8 +35,7 @@ from dsr.utils.guards import opened
 
 MARK = '<meta name="generator" content="dsr view">'
 """What a page begins with that a new one may replace."""
-VIEWER = ("core.js", "decode.js", "mesh.js", "webgl.js", "pose.js", "view.js")
-"""The scripts that show results in the elements of ``viewer.html``."""
+_SCRIPTS = ("core.js", "decode.js", "mesh.js", "webgl.js", "pose.js", "view.js")
 _COLOURS = "magma"
 ANGLES = (1.0, 60.0)
 """Ends of the colours of the normals' expected errors in degrees, those of ``confidence.png``."""
@@ -106,22 +105,8 @@ def save_view(path: Path, results: Sequence[Packed], *, title: str, notes: Seque
     A content security policy allows the page's own script, style and pictures alone, so that it cannot ask any server.
     All names are escaped, or shown as text by the script.
     """
-    style, script = asset("view.css"), f'"use strict";\n{asset(*VIEWER, "view_page.js")}'
-    parts = {
-        "POLICY": policy(style, script, "data: blob:"),
-        "TITLE": title,
-        "STYLE": style,
-        "SCRIPT": script,
-        "RESULTS": results,
-        "CONTENT": json_text(content_of(results, title, notes)),
-        "DATA": data_of(results),
-    }
-    write_text(path, fill("view.html", parts))
-
-
-def content_of(results: Sequence[Packed], title: str, notes: Sequence[str] = ()) -> dict[str, Any]:
-    """Return the data of results for the viewer, as values for JSON."""
-    return {
+    style, script = asset("view.css"), f'"use strict";\n{asset(*_SCRIPTS)}'
+    content = {
         "title": title,
         "notes": list(notes),
         "light": VIEWING_LIGHT,
@@ -129,11 +114,17 @@ def content_of(results: Sequence[Packed], title: str, notes: Sequence[str] = ())
         "colours": palette(_COLOURS),
         "results": [{**result.about, "thumb": data_url(result.pictures["thumb"])} for result in results],
     }
-
-
-def data_of(results: Sequence[Packed]) -> dict[str, str]:
-    """Return the surfaces and photos of results as base64 texts, by name and number: ``after-0``."""
-    return {f"{name}-{number}": data for number, result in enumerate(results) for name, data in result.data.items()}
+    parts = {
+        "MARK": MARK,
+        "POLICY": policy(style, script, "data: blob:"),
+        "TITLE": title,
+        "STYLE": style,
+        "SCRIPT": script,
+        "RESULTS": results,
+        "CONTENT": json_text(content),
+        "DATA": {f"{name}-{k}": data for k, result in enumerate(results) for name, data in result.data.items()},
+    }
+    write_text(path, fill("view.html", parts))
 
 
 def is_view(path: Path) -> bool:

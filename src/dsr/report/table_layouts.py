@@ -22,7 +22,7 @@ from dsr.utils.files import write_text
 MISSING = "\N{EN DASH}"
 _SPECIAL = re.compile(r"[\\`*\[\]<>|~&#]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])")
 _ROWS = 26
-"""Maximum rows of a page, which is in landscape format."""
+"""Maximum rows of a table in LaTeX: those of a page in landscape format."""
 _LATEX_SPECIAL = {
     "\\": "\\textbackslash{}", "{": "\\{", "}": "\\}", "$": "\\$", "&": "\\&", "#": "\\#", "%": "\\%", "_": "\\_",
     "~": "\\textasciitilde{}", "^": "\\textasciicircum{}", "<": "\\textless{}", ">": "\\textgreater{}",

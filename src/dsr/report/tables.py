@@ -168,11 +168,12 @@ def build_tables(results: Results, study: pd.DataFrame | None = None, *, interva
     if study is not None:
         check_study(study)
     complete = _truth_is_complete(results)
+    every = results.formats
     tables: list[PaperTable] = []
     names: set[str] = set()
     for scale, downsampling in dict.fromkeys((run.scale, run.downsampling) for run in results.runs):
         runs = [run for run in results.runs if (run.scale, run.downsampling) == (scale, downsampling)]
-        values = values_of(runs, results.formats)
+        values = values_of(runs, every)
         places = list(dict.fromkeys(place for scenes in values.values() for place in scenes))
         if not places:
             continue
@@ -184,7 +185,7 @@ def build_tables(results: Results, study: pd.DataFrame | None = None, *, interva
         for name, title, sets in kinds:
             shown_places = {place for each in sets for place in each.places}
             labels = [label for label in results.methods() if not shown_places.isdisjoint(values.get(label, ()))]
-            for family, formats in by_family(results.formats).items():
+            for family, formats in by_family(every).items():
                 paper = family == PAPER
                 groups = [_group(each, labels, runs, values, formats, study if paper else None) for each in sets]
                 if intervals:

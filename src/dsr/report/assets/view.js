@@ -1,4 +1,4 @@
-// The viewer: choices, the surfaces that they show, and what is written about them.
+// The page of `dsr view`: choices, the surfaces that they show, and what is written about them.
 
 const NAMES = { grey: "grey", photo: "the photo", filled: "grey with filled pixels in colour", depth: "the expected error of the depth", angle: "the expected error of the normal" };
 const UNITS = { depth: { factor: 1000, unit: "mm", title: "Expected error of the depth, mm" }, angle: { factor: 1, unit: "degrees", title: "Expected error of the normal, degrees" } };
@@ -8,17 +8,14 @@ const NARROW = 560; // pixels of a stage below which panels are one below anothe
 const HIGHEST = 0.82; // of the window, the height of a stage with panels, as in view.css
 
 class View {
-  /**
-   * Show results: their facts, a function that returns their data by name and number, and first choices.
-   */
-  constructor(content, data, choices = {}) {
+  /** Show the results of the page. */
+  constructor(content) {
     this.content = content;
-    this.data = data;
     this.palette = paletteOf(content.colours);
     this.stage = find("#stage");
     this.canvas = find("canvas", this.stage);
     this.scene = new Scene(this.canvas, this.palette, content.tones);
-    this.state = { side: "both", colour: "grey", drag: "turn", split: 0.5, light: content.light, doubtful: false, number: -1, ...choices };
+    this.state = { side: "both", colour: "grey", drag: "turn", split: 0.5, light: content.light, doubtful: false, number: -1 };
     find("#viewer").hidden = false;
     find("#stills").hidden = true;
     this.listen();
@@ -28,15 +25,6 @@ class View {
     this.set("drag", this.state.drag);
     const named = content.results.findIndex((result) => `#${encodeURIComponent(result.name)}` === location.hash);
     this.show(Math.max(named, 0));
-  }
-
-  /** Take other results in place of those that are shown; light and choices stay. */
-  take(content, data) {
-    this.content = content;
-    this.data = data;
-    this.makeChoice();
-    find("#viewer").hidden = false;
-    return this.show(0);
   }
 
   // What is shown.
@@ -49,9 +37,9 @@ class View {
     this.result = result;
     this.stage.setAttribute("aria-busy", "true");
     find(".busy").hidden = false;
-    const photo = this.data(`photo-${shown}`);
+    const photo = textOf(`photo-${shown}`);
     const names = ["after", "before"].filter((name) => result[name]);
-    const [image, ...grids] = await Promise.all([photo && decodePhoto(photo), ...names.map((name) => decodeGrid(result[name], this.data(`${name}-${shown}`)))]);
+    const [image, ...grids] = await Promise.all([photo && decodePhoto(photo), ...names.map((name) => decodeGrid(result[name], textOf(`${name}-${shown}`)))]);
     if (this.state.number !== shown) return;
     this.grids = Object.fromEntries(names.map((name, k) => [name, grids[k]]));
     this.scene.setPhoto(image);
@@ -391,3 +379,15 @@ function fall(reason) {
   problem.textContent = reason;
   problem.hidden = false;
 }
+
+function start() {
+  try {
+    if (typeof DecompressionStream === "undefined") throw new Error("no DecompressionStream");
+    new View(block("content"));
+  } catch (error) {
+    fall(`The surface cannot be turned in this browser (${error.message}); here it is as pictures. A current Firefox, Chrome, Edge or Safari with WebGL 2 shows it.`);
+  }
+}
+
+addEventListener("unhandledrejection", (event) => { fall(`The surface could not be read (${event.reason?.message}).`); event.preventDefault(); });
+start();

@@ -87,8 +87,7 @@ def build_study(
         question = _draw(view, choice.light, notes)
         if question is not None:
             questions.append(question)
-            shown = {run.label for run in question.runs}
-            missing = sorted({run.label for run in selected.of(view.problem)} - shown)
+            missing = sorted({run.label for run in selected.of(view.problem)} - {run.label for run in view.runs})
             notes += [f"{view}: without {', '.join(missing)}, which has no prediction of it"] if missing else []
     if not questions:
         detail = f"; {notes[-1]}" if notes else ""
@@ -159,19 +158,22 @@ def _draw(view: View, light: str, notes: list[str]) -> _Question | None:
     if scene.depth is None:
         notes.append(f"left out: {view}: no ground truth")
         return None
+    reasons: list[str] = []
+    results = results_of(view, scene, reasons)
+    if len(results) < _FEWEST:
+        notes.append(f"left out: {view}: {'; '.join(reasons)}")
+        return None
+    notes += reasons
     truth = rendering(scene.depth, scene.camera, light)
     valid = np.isfinite(truth)
     labels: dict[bytes, str] = {}
     pictures = []
-    results = results_of(view, scene, notes)
     for result in results:
         picture = grey_png(rendering(result.depth, scene.camera, light), valid)
         label = result.run.label
         if labels.setdefault(picture, label) != label:
             notes.append(f"{view}: {labels[picture]} and {label} look exactly the same")
         pictures.append(picture)
-    if len(pictures) < _FEWEST:
-        return None
     runs = tuple(result.run for result in results)
     return _Question(view, runs, grey_png(truth, valid), tuple(pictures), (valid.shape[1], valid.shape[0]))
 
