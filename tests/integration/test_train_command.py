@@ -264,13 +264,19 @@ def test_interrupted_training_gives_bit_identical_weights_and_logs(whole, tmp_pa
 
 
 @pytest.mark.nightly
-def test_killed_training_goes_on_from_its_checkpoint(tmp_path, within):
+@pytest.mark.parametrize(("number", "returned"), [(signal.SIGKILL, -9), (signal.SIGTERM, 143)])
+def test_stopped_training_goes_on_from_its_checkpoint(tmp_path, within, number, returned):
     many = (*SMOKE, "trainer.max_steps=24", "trainer.val_check_interval=4")
     with Program(TRAIN, *many, "output_dir=out", cwd=tmp_path) as process:
         deadline = time.monotonic() + 60
         while not (tmp_path / "out/checkpoints/last.ckpt").exists() and time.monotonic() < deadline:
             time.sleep(0.02)
-        process.send_signal(signal.SIGKILL)
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == returned
+    if number == signal.SIGTERM:
+        step = last_step(tmp_path / "out")
+        assert errors.splitlines()[-1] == f"interrupted at step {step}; resume=out continues from there"
     assert not (tmp_path / "out" / "weights.safetensors").exists()
     code, output, errors = within("resume=out")
     assert (code, errors, "resumed" in output) == (0, [], True)
