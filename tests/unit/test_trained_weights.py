@@ -129,9 +129,7 @@ def test_weights_of_another_model_are_refused(tmp_path):
         TrainedNetwork(path, 4, "facets")
 
 
-@pytest.mark.parametrize(
-    ("write", "load", "variant"), [(_file, _load, "dsr"), (published, load_msg_weights, "voynov")]
-)
+@pytest.mark.parametrize(("write", "load", "variant"), [(_file, _load, "dsr"), (published, load_msg_weights, "voynov")])
 def test_missing_files_other_scales_and_other_tensors_are_refused_by_name(tmp_path, write, load, variant):
     with pytest.raises(FileNotFoundError, match=r"nowhere: no such weights file"):
         load(tmp_path / "nowhere", 4)
