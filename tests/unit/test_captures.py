@@ -601,6 +601,9 @@ def test_damaged_calibrations_of_a_zed_are_refused(tmp_path, old, new):
     with pytest.raises(ValueError, match=r"SN12345\.conf: ") as caught:
         camera_of(tmp_path)
     assert "\n" not in str(caught.value)
+    (tmp_path / "SN2.conf").write_bytes(path.read_bytes())
+    with pytest.raises(ValueError, match=r"expected one calibration of .*, got SN12345\.conf, SN2\.conf"):
+        find_pairs_of_folder(tmp_path)
 
 
 def packed(path, folder, inside=""):
