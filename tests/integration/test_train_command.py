@@ -208,6 +208,7 @@ USAGE_ERRORS = {
     "too few scenes": (["dataset.count=1"], "patches.validation_scenes: "),
     "a patch larger than a scene": (["patches.patch=128"], "patches.patch: expected at most 00000's 64 x 64, got 128"),
     "a data set to evaluate on": (["dataset=simgeo", "~dataset.count"], "dataset=simgeo: its scenes are to evaluate"),
+    "an assumed downsampling": (["downsampling.assumed=nearest"], "downsampling.assumed: "),
     "weights that are not there": (["start.weights=nowhere"], "start.weights: nowhere: no such weights file"),
     "parameters that are not there": (["start.frozen=[wide.*]"], "start.frozen: "),
     "factors that do not fit": (
