@@ -25,6 +25,7 @@ import small_golden
 import torch
 from methods_at_hand import AT_HAND
 from reference_metrics import Array
+from small_scenes import seeded
 from torch import Tensor
 
 import dsr
@@ -191,7 +192,7 @@ def samples() -> Iterator[tuple[str, Job]]:
     large = _large_scene()
     assert large.depth is not None
     holey = replace(
-        large, depth=large.depth.masked_fill(torch.rand((1, 192, 192), generator=_seeded(0)) < 0.5, torch.nan)
+        large, depth=large.depth.masked_fill(torch.rand((1, 192, 192), generator=seeded(0)) < 0.5, torch.nan)
     )
     for kernel in ("box", "bicubic", "gaussian"):
         yield (
@@ -229,7 +230,7 @@ def _drawn_often(everything: Everything) -> Job:
 
     def run() -> Tensor:
         part = _large_scene().crop(60, 60, 64, 64)
-        maps = [everything(part, 2, _seeded(seed))[0].depth_lr for seed in range(24)]
+        maps = [everything(part, 2, seeded(seed))[0].depth_lr for seed in range(24)]
         return torch.stack([each.nanmean() for each in maps])
 
     return run
@@ -326,7 +327,7 @@ def geometry() -> Iterator[tuple[str, Job]]:
         yield f"stairs at {size}", lambda size=size: resize_inverse_depth(_stairs().reciprocal(), (size, size))
     stairs = _stairs().reciprocal().masked_fill(~known, torch.nan)
     yield "inpainted stairs", lambda: inpaint(stairs[None].float(), scene.rgb[None].float())[0]
-    noisy = [depth * (1 + 0.002 * torch.randn(depth.shape, generator=_seeded(seed))) for seed in range(3)]
+    noisy = [depth * (1 + 0.002 * torch.randn(depth.shape, generator=seeded(seed))) for seed in range(3)]
     pose = moved.numpy().copy()
 
     def fused() -> list[Tensor]:
@@ -470,10 +471,6 @@ def _large_scene() -> Scene:
     rgb = np.clip(colour + random.normal(0, 0.01, colour.shape), 0, 1)
     camera = dsr.Camera(192, 192, 190.0, 190.0, 95.5, 95.5)
     return Scene("golden", "large", torch.from_numpy(rgb).float(), camera, torch.from_numpy(depth)[None])
-
-
-def _seeded(seed: int) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def _stairs() -> Tensor:

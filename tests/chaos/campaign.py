@@ -144,7 +144,7 @@ class Campaign:
                 return hits + hit, [f"{strike}: {line}" for line in problems]
             hits += hit
             stamps |= _stamps(self.work)
-        return hits, self._finish(name, name, stamps)
+        return hits, self._finish(name, stamps)
 
     def pair(self, name: str, delay: float) -> list[str]:
         """Run two commands at once, the second after a fraction of the first one's time; return what is wrong."""
@@ -158,13 +158,13 @@ class Campaign:
         ends = [command.end(LIMIT) for command in running]
         problems = [line for end in ends if not _refused(end) for line in end_problems(end)] + damaged(self.work)
         if not rivals:
-            return problems + self._finish(name, name, {})
+            return problems + self._finish(name, {})
         codes = [end.code for end in ends]
         if sorted(codes, key=str) != [0, 2]:
             return [*problems, f"exit codes {codes}, expected that one is refused"]
         return problems + differences(self.root / "undisturbed" / rivals[codes.index(0)], self.work)
 
-    def _finish(self, name: str, reference: str, stamps: dict[Path, tuple[int, int]]) -> list[str]:
+    def _finish(self, name: str, stamps: dict[Path, tuple[int, int]]) -> list[str]:
         """Run the commands to their ends; return what differs from undisturbed results, and what was made again."""
         ends = [Command(each, self.work).end(LIMIT) for each in ALL[name].commands]
         after = _stamps(self.work)
@@ -172,7 +172,7 @@ class Campaign:
             *(line for end in ends for line in end_problems(end)),
             *(f"{path.name}: was complete, and was made again" for path in stamps if after.get(path) != stamps[path]),
             *damaged(self.work),
-            *differences(self.root / "undisturbed" / reference, self.work),
+            *differences(self.root / "undisturbed" / name, self.work),
         ]
 
 

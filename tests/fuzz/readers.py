@@ -293,7 +293,7 @@ def read_checksums(path: Path) -> None:
 
 def caffe_model(path: Path) -> None:
     tests = unit("test_trained_weights")
-    path.write_bytes(tests._caffemodel(tests._caffe_layers(MSGNet(2, "hui"))))
+    path.write_bytes(tests.caffemodel(tests.caffe_layers(MSGNet(2, "hui"))))
 
 
 def peer(path: Path) -> None:
@@ -308,7 +308,7 @@ FILES = {
     "trajectory.log": (single_files.text("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"), read_poses),
     "times.txt": (single_files.text("# time tx ty tz qx qy qz qw\n1305031102.03 0.1 0.2 -0.3 0 0 0 1\n"), read_poses),
     "foreground.png": (single_files.picture, lambda path: read_foreground(path, (48, 64))),
-    "published.pth": (lambda path: unit("test_trained_weights")._published(path),
+    "published.pth": (lambda path: unit("test_trained_weights").published(path),
                       lambda path: load_msg_weights(path, 4)),
     "hui.caffemodel": (caffe_model, lambda path: load_msg_weights(path, 2)),
     **{name: (peer, lambda path: load_peer(path, SVLRM, 4)) for name in ("peer.pth", "peer_old.pth")},

@@ -228,6 +228,8 @@ USAGE_ERRORS = {
     "an added key": (["+scal=8"], "scal: unknown key; expected one of names, "),
     "a group taken away": (["~method"], "method: missing"),
     "a scale that is none": (["scale=3"], "scale: "),
+    "a noise that cannot be": (["noise=gaussian_multiplicative", "noise.std=2"], "noise.std: "),
+    "an assumed downsampling": (["downsampling.assumed=nearest"], "downsampling.assumed: "),
     "no worker": (["workers=0"], "workers: "),
     "half a thread": (["threads=0.5"], "threads: "),
     "an unknown alignment": (["metrics.alignment=median"], "metrics.alignment: expected one of"),

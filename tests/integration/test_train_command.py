@@ -197,18 +197,25 @@ def test_diverged_training_writes_no_weights_of_it(tmp_path, within):
 
 USAGE_ERRORS = {
     "a weight that is none": (["loss.w=abc"], "loss.w: "),
+    "a mistyped loss": (["model.objective.depth_loss=l3"], "model.objective.depth_loss: "),
     "no step": (["trainer.max_steps=0"], "trainer.max_steps: "),
     "a learning rate of nan": (["model.optimizer.lr=nan"], "model.optimizer: "),
     "an argument of the trainer that dsr sets": (["+trainer.num_nodes=2"], "trainer.num_nodes: "),
     "a trainer that Lightning refuses": (["+trainer.gradient_clip_algorithm=foo"], "trainer: "),
+    "an unknown argument of the trainer": (["+trainer.tpu_cores=3"], "trainer.tpu_cores: "),
+    "a visual loss of a model without": (["model=msg", "loss.visual=dssim"], "loss.visual: model=msg has "),
     "a visual loss without its network": (["loss.visual=lpips", "metrics.lpips_trunk=none.pth"], "loss.visual: lpips "),
     "too few scenes": (["dataset.count=1"], "patches.validation_scenes: "),
     "a patch larger than a scene": (["patches.patch=128"], "patches.patch: expected at most 00000's 64 x 64, got 128"),
     "a data set to evaluate on": (["dataset=simgeo", "~dataset.count"], "dataset=simgeo: its scenes are to evaluate"),
+    "an assumed downsampling": (["downsampling.assumed=nearest"], "downsampling.assumed: "),
     "weights that are not there": (["start.weights=nowhere"], "start.weights: nowhere: no such weights file"),
     "parameters that are not there": (["start.frozen=[wide.*]"], "start.frozen: "),
+    "factors that do not fit": (
+        ["model=facets", "degradation=everything", "degradation.scales={4: 1, 8: 1}"], "degradation.scales: ",
+    ),
     "a directory that is none to resume": (["resume=foreign"], "resume: continues with the run's own configuration"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", USAGE_ERRORS)
@@ -264,13 +271,19 @@ def test_interrupted_training_gives_bit_identical_weights_and_logs(whole, tmp_pa
 
 
 @pytest.mark.nightly
-def test_killed_training_goes_on_from_its_checkpoint(tmp_path, within):
+@pytest.mark.parametrize(("number", "returned"), [(signal.SIGKILL, -9), (signal.SIGTERM, 143)])
+def test_stopped_training_goes_on_from_its_checkpoint(tmp_path, within, number, returned):
     many = (*SMOKE, "trainer.max_steps=24", "trainer.val_check_interval=4")
     with Program(TRAIN, *many, "output_dir=out", cwd=tmp_path) as process:
         deadline = time.monotonic() + 60
         while not (tmp_path / "out/checkpoints/last.ckpt").exists() and time.monotonic() < deadline:
             time.sleep(0.02)
-        process.send_signal(signal.SIGKILL)
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == returned
+    if number == signal.SIGTERM:
+        step = last_step(tmp_path / "out")
+        assert errors.splitlines()[-1] == f"interrupted at step {step}; resume=out continues from there"
     assert not (tmp_path / "out" / "weights.safetensors").exists()
     code, output, errors = within("resume=out")
     assert (code, errors, "resumed" in output) == (0, [], True)

@@ -142,8 +142,8 @@ def test_pixels_of_too_little_confidence_become_holes(folder, name):
 @pytest.mark.parametrize("name", CASES)
 def test_a_file_that_is_cut_off_is_one_line_that_names_it(folder, name):
     place = CASES[name].write(folder)
-    path = max((path for path in folder.rglob("*") if path.is_file()), key=lambda path: path.stat().st_size)
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    path = max((path for path in folder.rglob("*") if path.is_file()), key=lambda path: (path.stat().st_size, path))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 + 1])
     problems = []
     try:
         pairs = find_pairs_of_folder(place).pairs
@@ -154,6 +154,7 @@ def test_a_file_that_is_cut_off_is_one_line_that_names_it(folder, name):
             read_picture(pair, Reading())
         except ValueError as error:
             problems.append(str(error))
+    assert problems
     assert all("\n" not in problem and str(folder) in problem for problem in problems)
     assert all(path.name in problem or place.name in problem for problem in problems)
 
@@ -600,6 +601,9 @@ def test_damaged_calibrations_of_a_zed_are_refused(tmp_path, old, new):
     with pytest.raises(ValueError, match=r"SN12345\.conf: ") as caught:
         camera_of(tmp_path)
     assert "\n" not in str(caught.value)
+    (tmp_path / "SN2.conf").write_bytes(path.read_bytes())
+    with pytest.raises(ValueError, match=r"expected one calibration of .*, got SN12345\.conf, SN2\.conf"):
+        find_pairs_of_folder(tmp_path)
 
 
 def packed(path, folder, inside=""):

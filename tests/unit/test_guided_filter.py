@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -13,7 +12,7 @@ from small_scenes import disparity_of, plane, sample_of
 from dsr.geometry.camera import Camera, to_range
 from dsr.methods.classical.bilateral import Bilateral, JointBilateral, filter_bilateral
 from dsr.methods.classical.fast_global_smoother import FastGlobalSmoother, smooth, solve_lines
-from dsr.methods.classical.guided_filter import GuidedFilter, GuidedMethod, estimate_slopes, guided_filter
+from dsr.methods.classical.guided_filter import GuidedFilter, estimate_slopes, guided_filter
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.sample import DepthSample
 
@@ -89,7 +88,6 @@ def test_frame_of_a_structured_light_camera_is_filtered_as_opencv_does(shared):
 
 METHODS = (GuidedFilter, JointBilateral, FastGlobalSmoother)
 every_method = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.__name__)
-Build = Callable[..., GuidedMethod]
 
 
 def _noise(*shape, seed=0):

@@ -102,6 +102,13 @@ def test_camera_info_that_is_none_is_one_line(tmp_path, of_info, said):
         read_first(path)
 
 
+def test_recording_without_depth_is_refused_with_its_topics(tmp_path):
+    path = captures.ros(tmp_path / "a.bag", 1)
+    path.write_bytes(path.read_bytes().replace(b"16UC1", b"mono8"))
+    with pytest.raises(ValueError, match=f"^{path}: expected a topic of depth .* got /camera/aligned_depth"):
+        find_pairs_of_folder(path)
+
+
 @pytest.mark.parametrize("suffix", [".db3", ".mcap"])
 def test_file_of_ros_2_is_read_without_its_folder(tmp_path, suffix):
     folder = captures.ros(tmp_path / "whole", 2, plugin="MCAP" if suffix == ".mcap" else "SQLITE3")

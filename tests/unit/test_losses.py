@@ -1,7 +1,6 @@
 """Losses of trainings, against plain computations, closed forms, finite differences and the metrics' kernels."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import get_args
 
@@ -12,7 +11,6 @@ from scipy import sparse
 from scipy.sparse import linalg
 from small_lpips import random_lpips
 from small_scenes import grid
-from torch import Tensor
 from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling, make_sample
@@ -37,7 +35,6 @@ from dsr.training.objective import (
     shading_loss,
 )
 
-Loss = Callable[..., Tensor]
 LOSSES = {"l1": l1, "mse": mse, "lap1": lap1}
 TAPS = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 

@@ -22,7 +22,6 @@ WITHOUT_LIGHTS = {
     *("RMSE_v", "Bumpiness_d"),
 }
 WITH_LIGHTS = {*(f"BadPix_v_{level}" for level in (1, 5, 10)), "DSSIM_v", "LPIPS_v", "RMSE_v1"}
-Row = tuple[str, str]
 
 
 @pytest.fixture(scope="module")

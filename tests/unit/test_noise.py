@@ -4,7 +4,6 @@ The noise of cameras drawn at random has the stated amplitudes, lengths, steps, 
 """
 
 import math
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -18,7 +17,6 @@ from dsr.degradation.random_fields import field_of, waves_of
 from dsr.geometry.camera import RANGE_TYPES, Camera, from_range, to_range
 from dsr.sample import Scene
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 CAMERA = Camera(8, 4, 10.0, 10.0, 3.5, 1.5, baseline=0.1, doffs=0.5)
 STEPS = torch.arange(32, dtype=torch.float64).view(1, 4, 8) / 16 + 1
 KINDS = (GaussianMultiplicative(0.02), TimeOfFlight(), Kinect())

@@ -27,6 +27,7 @@ from dsr.methods.networks.trained import NETWORKS
 
 onnx = pytest.importorskip("onnx", reason="pip install -e '.[onnx]'")
 onnxruntime = pytest.importorskip("onnxruntime", reason="pip install -e '.[onnx]'")
+pytestmark = pytest.mark.filterwarnings("ignore")  # of the exporter
 
 SMALL = {
     "facets": (lambda: FacetsUNet(4, 8, 8, 3), 4),
@@ -153,10 +154,6 @@ def test_missing_library_is_named_with_its_extra(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"onnxruntime; pip install .*\[onnx\]"):
         write_onnx(tmp_path / "net.onnx", OnnxGraph(*random_network("dg")), {})
     assert list(tmp_path.iterdir()) == []
-
-
-pytestmark = pytest.mark.filterwarnings("ignore")  # of the exporter
-pytest.importorskip("onnxruntime", reason="pip install -e '.[onnx]'")
 
 
 @pytest.fixture
@@ -288,7 +285,6 @@ def test_photo_is_resized_for_a_network_that_sees_it_alone(tmp_path):
 
 
 def test_content_follows_weights_that_lie_beside_the_graph(tmp_path):
-    onnx = pytest.importorskip("onnx")
     path, beside = tmp_path / "net.onnx", tmp_path / "net.data"
     inputs, found = {"photo": "image", "inverse_depth": "lr", "valid": "valid"}, []
     for seed in range(2):

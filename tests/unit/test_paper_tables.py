@@ -80,6 +80,7 @@ def test_aligned_scores_are_noted_and_not_beside_the_papers():
         found = tables(each)["simgeo_x4_box"]
         assert found.has_published is beside
         assert any("affine_disparity" in note for note in found.notes) is not beside
+        assert any(note.startswith("Not computed: BadPix_d_5cm") for note in found.notes)
 
 
 def test_seeds_are_averaged_first_and_their_averages_give_the_spread():

@@ -210,6 +210,15 @@ def test_reduced_values_are_averages_of_valid_pixels():
     assert known.tolist() == [[True, True], [False, True]]
 
 
+def test_page_has_mean_and_standard_deviation_of_several_seeds(make_run, tmp_path):
+    results = load_results([make_run(tmp_path / "runs" / str(seed), seed=seed) for seed in range(3)])
+    scores = results.scores
+    own = scores[scores["metric"] == "RMSE_d"]["value"] * 1000
+    [problem] = saved(tmp_path, results)[1]["problems"]
+    for row in (problem["means"][0], problem["rows"][0]):
+        assert (row["seeds"], row["values"]["RMSE_d"]) == (3, pytest.approx([own.mean(), own.std()]))
+
+
 def test_run_without_stored_scenes_has_tables_and_says_why_no_pictures(make_run, tmp_path):
     folder = make_run(tmp_path / "run")
     (folder / "scenes" / "cube_no_texture.npz").unlink()

@@ -75,7 +75,7 @@ def test_file_is_distinguished_from_a_published_one_by_its_content(tmp_path):
 
 def test_trained_networks_default_to_averaging_over_quarter_turns_and_published_ones_to_none(tmp_path):
     save_network(tmp_path / "w", MSGNet(4, "dsr"), "msg_v")
-    _published(tmp_path / "net.pth")
+    published(tmp_path / "net.pth")
     for path, default in ((tmp_path / "w", 4), (tmp_path / "net.pth", 1)):
         assert TrainedNetwork(path, 4, "msg_v", "voynov").ensemble == default
         assert TrainedNetwork(path, 4, "msg_v", "voynov", ensemble=8).ensemble == 8
@@ -102,7 +102,7 @@ def _author_state(state):
     return found
 
 
-def _published(path, state=None):
+def published(path, state=None):
     """Write a file like Voynov et al.'s."""
     torch.save({"model_state_dict": _author_state(MSGNet(4).state_dict() if state is None else state)}, path)
     return path
@@ -129,9 +129,7 @@ def test_weights_of_another_model_are_refused(tmp_path):
         TrainedNetwork(path, 4, "facets")
 
 
-@pytest.mark.parametrize(
-    ("write", "load", "variant"), [(_file, _load, "dsr"), (_published, load_msg_weights, "voynov")]
-)
+@pytest.mark.parametrize(("write", "load", "variant"), [(_file, _load, "dsr"), (published, load_msg_weights, "voynov")])
 def test_missing_files_other_scales_and_other_tensors_are_refused_by_name(tmp_path, write, load, variant):
     with pytest.raises(FileNotFoundError, match=r"nowhere: no such weights file"):
         load(tmp_path / "nowhere", 4)
@@ -200,7 +198,7 @@ def _blob(values, *, packed):
     return singly + _field(7, b"".join(_varint(1 << 3) + _varint(size) for size in sizes))
 
 
-def _caffe_layers(net):
+def caffe_layers(net):
     """Return the network's layers as Caffe keeps them: a convolution with two blobs, then a PReLU with one."""
     layers = []
     for name, value in net.state_dict().items():
@@ -213,7 +211,7 @@ def _caffe_layers(net):
     return layers
 
 
-def _caffemodel(layers, *, packed=True):
+def caffemodel(layers, *, packed=True):
     """Return a NetParameter: its name, an input layer without parameters, a number field, the layers."""
     content = _field(1, b"a test") + _varint(5 << 3) + b"\x01"
     content += _field(100, _field(1, b"data") + _field(2, b"HDF5Data"))
@@ -232,7 +230,7 @@ def _write(path, content):
 @pytest.mark.parametrize("scale", [2, 8])
 def test_caffe_model_round_trips_its_parameters(tmp_path, scale, packed):
     net = MSGNet(scale, "hui")
-    path = _write(tmp_path / "net.caffemodel", _caffemodel(_caffe_layers(net), packed=packed))
+    path = _write(tmp_path / "net.caffemodel", caffemodel(caffe_layers(net), packed=packed))
     loaded = load_msg_weights(path, scale)
     assert loaded.variant == "hui"
     torch.testing.assert_close(dict(loaded.state_dict()), dict(net.state_dict()), rtol=0, atol=0)
@@ -240,7 +238,7 @@ def test_caffe_model_round_trips_its_parameters(tmp_path, scale, packed):
 
 def test_torch_file_round_trips_its_parameters(tmp_path):
     net = MSGNet(4)
-    path, before = _published(tmp_path / "net.pth", net.state_dict()), torch.get_rng_state()
+    path, before = published(tmp_path / "net.pth", net.state_dict()), torch.get_rng_state()
     loaded = load_msg_weights(path, 4, "voynov")
     assert torch.equal(torch.get_rng_state(), before)
     assert loaded.variant == "voynov"
@@ -257,14 +255,14 @@ def test_code_in_a_file_is_not_run(tmp_path):
 
 
 def test_damaged_and_foreign_files_are_refused(tmp_path):
-    whole, path = _published(tmp_path / "whole.pth").read_bytes(), tmp_path / "net.caffemodel"
+    whole, path = published(tmp_path / "whole.pth").read_bytes(), tmp_path / "net.caffemodel"
     noise = np.random.default_rng(0).bytes(10_000)
     foreign = (b"", noise, b"\x80" + noise, b"PK\x03\x04" + noise, b"\x89PNG\r\n\x1a\n")
     for content in (whole[:5000], whole[:-30], *foreign):
         assert "expected a torch" in _refusal(_write(tmp_path / "net.pth", content), load_msg_weights, 4)
     for content in (b"\xff" * 11, b"\xa2\x06\xff\xff\xff\xff\x0f\x00", b"\x0b", b"\xa0\x06\x01", _field(1, b"name")):
         assert "expected a torch or Caffe model" in _refusal(_write(path, content), load_msg_weights, 4)
-    whole = _caffemodel(_caffe_layers(MSGNet(2, "hui")))
+    whole = caffemodel(caffe_layers(MSGNet(2, "hui")))
     for length in np.random.default_rng(0).integers(1, len(whole), 40).tolist():
         assert "expected" in _refusal(_write(path, whole[:length]), load_msg_weights, 2)
     assert "for scale 2, the run is at scale 4" in _refusal(_write(path, whole), load_msg_weights, 4)
