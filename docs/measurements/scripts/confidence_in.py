@@ -1,7 +1,7 @@
 # Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """Measure three uses of a confidence map: none, holes in place of unsure pixels, and the noise of each level given.
 
-    python benchmarks/confidence_in.py [--scenes DIR] [--scale 8] [--seed 1]
+    python docs/measurements/scripts/confidence_in.py [--scenes DIR] [--scale 8] [--seed 1]
 
 ``DIR`` has ``lucy`` and ``plant``. Their maps, box means, get noise whose standard deviation depends on the confidence:
 a fifth of the pixels, in patches, is of level 0, three tenths of level 1, and the rest of level 2. The noise of a level

@@ -1,7 +1,7 @@
 # Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """How much faster a step of DIP-V is than the plain way, and that nothing is lost by it.
 
-    python benchmarks/dip_speed.py [--size 256] [--steps 5] [--threads N] [--quality-steps 0] [--device cpu]
+    python docs/measurements/scripts/dip_speed.py [--size 256] [--steps 5] [--threads N] [--quality-steps 0] [--device cpu]
 
 The plain way is that of the original's code: float32, PyTorch's default memory layout, the library's bilinear
 upsampling, 128 channels in each level. ``same network`` is ours with these channels, ``default`` with ours.

@@ -1,7 +1,7 @@
 # Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """Measure how flat methods leave two floors that real sensors saw, and beside it how true they leave a person.
 
-    python benchmarks/flatness.py --shared DIR [--methods facets,bilateral,...] [--device cpu]
+    python docs/measurements/scripts/flatness.py --shared DIR [--methods facets,bilateral,...] [--device cpu]
 
 Flatness is the mean angle in degrees between the normals inside a polygon, which is a plane, and their mean: of a
 phone's map at x7.5 (``iphone_lidar``) and of a stereo depth camera's at x1 (``depth_camera_0``). As blur is flat, too,

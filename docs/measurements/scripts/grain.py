@@ -1,7 +1,7 @@
 # Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """Measure how metrics of renderings react to grain: white noise that is added to a method's depth.
 
-    python benchmarks/grain.py --scenes DIR [--method facets] [--scale 4] [--levels 0,0.0001,0.0002,0.0005]
+    python docs/measurements/scripts/grain.py --scenes DIR [--method facets] [--scale 4] [--levels 0,0.0001,0.0002,0.0005]
         [--device cpu]
 
 Noise is normal, its standard deviation a fraction of the depth. Prints a Markdown table; metrics with _v but RMSE_v

@@ -1,7 +1,7 @@
 # Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """How holes are filled: today's filling, the farther depth of the rim, and what the colours say; sheets are counted.
 
-    python benchmarks/holes.py [--shared DIR] [--ratio 4] [--method facets] [--rules NAME...] [--kinds NAME...]
+    python docs/measurements/scripts/holes.py [--shared DIR] [--ratio 4] [--method facets] [--rules NAME...] [--kinds NAME...]
         [--scenes NAME...] [--pictures DIR] [--seed 1]
 
 Holes are cut into low-resolution maps, box means of the inverse depth of scenes of Middlebury 2014 and ICL-NUIM:

@@ -1,7 +1,7 @@
 # Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """How metrics agree on real methods: which ones rank the methods of a scene alike.
 
-    python benchmarks/how_metrics_agree.py outputs/eval -o how_metrics_agree
+    python docs/measurements/scripts/how_metrics_agree.py outputs/eval -o how_metrics_agree
 
 Reads the runs of ``eval.py``, best of ``metrics=suite``, of several methods over several data sets. For each scene and
 factor, the methods are ranked by each metric; Kendall's tau-b of two rankings is 1 where they are the same and 0 where

@@ -1,7 +1,7 @@
 # Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """How well DIP-V fills holes: its error inside of them against interpolation after a fill with the nearest known pixel.
 
-    python benchmarks/inpainting.py --scenes DIR [--steps 400] [--scale 4] [--picture FILE] [--crop N]
+    python docs/measurements/scripts/inpainting.py --scenes DIR [--steps 400] [--scale 4] [--picture FILE] [--crop N]
         [--device cpu]
 
 Two kinds of holes are cut into the low-resolution maps of Lucy and Plant: random blobs of 10 % of the pixels, and the

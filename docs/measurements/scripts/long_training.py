@@ -1,7 +1,7 @@
 # Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """Train facets for days: stages in turn, each a training of about an hour, and after each a row of all yardsticks.
 
-    python benchmarks/long_training.py [PLAN] [-o DIR] [--shared DIR] [--stages N]
+    python docs/measurements/scripts/long_training.py [PLAN] [-o DIR] [--shared DIR] [--stages N]
 
 ``PLAN`` is ``long_training.yaml`` beside this file: ``stages``, each with the name of its ``weights``, its ``steps``
 and further ``overrides`` of ``train.py``, and the ``parts`` of ``real_sensors.py`` that are measured. Each stage starts

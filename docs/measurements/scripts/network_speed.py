@@ -1,7 +1,7 @@
 # Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """Where a network's answer spends its time: how near its convolutions are to the fastest matrix products.
 
-    python benchmarks/network_speed.py [--networks facets,facets_box,msg_v] [--scale 4] [--size 512] [--device cpu]
+    python docs/measurements/scripts/network_speed.py [--networks facets,facets_box,msg_v] [--scale 4] [--size 512] [--device cpu]
 
 Each network answers for a random photo in the precision that is fast on the device. The time of every convolution is
 measured apart, with an input of its size, and its floating-point operations are counted; the rest of the answer's time

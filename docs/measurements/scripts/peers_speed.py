@@ -6,8 +6,8 @@ the seconds until a GPU is done. The authors' code and weights are not part of d
 with their repositories under the names that `git clone` gives them, the second one with their weights
 (docs/methods.md):
 
-    python benchmarks/peers_speed.py CHECKOUTS WEIGHTS
-    python benchmarks/peers_speed.py CHECKOUTS WEIGHTS --only pgsr fdkn --size 256 [--device cuda]
+    python docs/measurements/scripts/peers_speed.py CHECKOUTS WEIGHTS
+    python docs/measurements/scripts/peers_speed.py CHECKOUTS WEIGHTS --only pgsr fdkn --size 256 [--device cuda]
 
 What the authors' files import for their training only and is not installed is replaced by a placeholder.
 """

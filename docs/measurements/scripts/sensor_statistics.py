@@ -1,7 +1,7 @@
 # Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """Compare the statistics of real sensors' maps with those of the simulated sensors that a network is trained on.
 
-    python benchmarks/sensor_statistics.py [--shared DIR] [--scenes 6] [--draws 4] [--sheet FILE] [--only KIND,...]
+    python docs/measurements/scripts/sensor_statistics.py [--shared DIR] [--scenes 6] [--draws 4] [--sheet FILE] [--only KIND,...]
 
 ``DIR`` holds ``real``; without it simulated sensors stand alone. Simulated maps are drawn at factor 1 from rendered
 scenes (``dataset=procedural``), in millimetres as cameras write them. The first table has a map's amplitude of noise

@@ -1,7 +1,7 @@
 # Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """What neighbouring frames gain: RMSE_v and flicker with 1, 3 and 5 frames, fused before or after the network.
 
-    python benchmarks/sequences.py [--size 192] [--scale 2] [--noise kinect] [--procedural 3] [--ddrnet DIR]
+    python docs/measurements/scripts/sequences.py [--size 192] [--scale 2] [--noise kinect] [--procedural 3] [--ddrnet DIR]
                                    [--picture FILE.jpg]
 
 On SimGeo's solids, rendered from seven places along a path, with the noise of a simulated sensor and exact poses; on

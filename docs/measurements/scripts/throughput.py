@@ -1,10 +1,10 @@
 # Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """Frames a second of ``dsr upsample`` per core, with one and with two workers, and where the time goes.
 
-    python benchmarks/throughput.py [--frames 24] [--rounds 3] [--rgb PHOTO --depth MAP] [--ratio 4]
+    python docs/measurements/scripts/throughput.py [--frames 24] [--rounds 3] [--rgb PHOTO --depth MAP] [--ratio 4]
                                    [--method facets] [--only depth] [--device cpu]
-    python benchmarks/throughput.py --profile [--ratio 1]
-    python benchmarks/throughput.py --list 100000
+    python docs/measurements/scripts/throughput.py --profile [--ratio 1]
+    python docs/measurements/scripts/throughput.py --list 100000
 
 Frames are a photo of 640 x 480 and a noisy map of 160 x 120, or with ``--ratio 1`` of 640 x 480, in millimetres,
 rendered unless a pair is given, each under a name of its own. One worker runs on one core, two on two, in turns, and

@@ -1,8 +1,8 @@
 # Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """How much faster a training step of MSG-V is than in a plain float32 loop, data included; and where its time goes.
 
-    python benchmarks/train_speed.py [--patch 96] [--batch 5] [--steps 9] [--device cuda]
-    python benchmarks/train_speed.py --profile [--steps 40] [--device cuda] [model=facets degradation=everything ...]
+    python docs/measurements/scripts/train_speed.py [--patch 96] [--batch 5] [--steps 9] [--device cuda]
+    python docs/measurements/scripts/train_speed.py --profile [--steps 40] [--device cuda] [model=facets degradation=everything ...]
 
 With --profile a training as train.py does it, with its log and checks, is timed: the network and its losses forward and
 backward, the patches, the optimiser, and everything else. Other arguments are overrides of train.py's configuration.

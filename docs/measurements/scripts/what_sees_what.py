@@ -1,7 +1,7 @@
 # Frozen: this measured once what the documentation says of it, from benchmarks/. It is not maintained.
 """Which metric sees which error: controlled distortions of true surfaces, all of the same depth error.
 
-    python benchmarks/what_sees_what.py [--scenes DIR] [--lpips FILE] -o what_sees_what
+    python docs/measurements/scripts/what_sees_what.py [--scenes DIR] [--lpips FILE] -o what_sees_what
 
 Seven distortions, five strengths each. Six of them, of inverse depth, have the same RMSE of relative depth at each
 strength, found by bisection: bumps (smooth, 16 pixels wide), grain (alike over 1.5 pixels), white noise, steps
