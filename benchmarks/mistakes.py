@@ -49,8 +49,7 @@ from dsr.geometry.agreement import depth_outlines, find_misplaced, judge, photo_
 from dsr.geometry.camera import Camera
 from dsr.geometry.poses import READINGS, Matrix, PosedMap, find_fault, invert, sample
 from dsr.io import inputs
-from dsr.io.depth_files import read_depth_file
-from dsr.io.encoding import Encoding
+from dsr.io.depth_files import Encoding, read_depth_file
 from dsr.io.inputs import Picture
 from dsr.notes import LIMITS
 from dsr.sample import AllHolesError, Scene

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from dsr.geometry.camera import Camera
-from dsr.io.depth_files import read_depth_file
-from dsr.io.encoding import Encoding, decode, encode, find_holes
+from dsr.io.depth_files import Encoding, decode, encode, find_holes, read_depth_file
 from dsr.io.reading import parse_unit
 from dsr.io.units import interpret
 

@@ -13,8 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from dsr.geometry.camera import Camera
 from dsr.io.depth_files import write_depth_file
-from dsr.io.open3d import write_open3d, write_rgbd
-from dsr.io.scene_files import Frame, parse_pose, to_millimetres, write_rerun, write_splatting, write_transforms
+from dsr.io.scene_files import (
+    Frame,
+    parse_pose,
+    to_millimetres,
+    write_open3d,
+    write_rerun,
+    write_rgbd,
+    write_splatting,
+    write_transforms,
+)
 
 CAMERA = Camera(12, 8, 10.0, 11.0, 5.25, 3.5)
 POSE = torch.tensor(

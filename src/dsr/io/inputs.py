@@ -27,8 +27,16 @@ from dsr.io.cameras import (
     scale_to_photo,
     to_photo,
 )
-from dsr.io.depth_files import ICL_CAMERA, ICL_SUFFIX, read_depth_file
-from dsr.io.encoding import Encoding, decode, expect_known, find_holes, turn_back_bits
+from dsr.io.depth_files import (
+    ICL_CAMERA,
+    ICL_SUFFIX,
+    Encoding,
+    decode,
+    expect_known,
+    find_holes,
+    read_depth_file,
+    turn_back_bits,
+)
 from dsr.io.frames import SLACK, Geometry, Rig
 from dsr.io.images import Size, pixels_in_header, read_mask
 from dsr.io.pairs import Pair, find_camera_file, role_of_words, words_of

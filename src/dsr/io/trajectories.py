@@ -13,7 +13,8 @@ import numpy as np
 from dsr.geometry.camera import Camera
 from dsr.geometry.plausible import may_be_of
 from dsr.geometry.poses import Matrix, as_rigid, from_quaternion, is_rotation
-from dsr.io.pairs import Pair
+from dsr.io.frames import CaptureFrame, Geometry, stated
+from dsr.io.pairs import Pair, PairingResult
 from dsr.notes import Assumption
 from dsr.utils.guards import naming, numbers_in, parse_json, read_text, refusing, split_numbers
 
@@ -22,6 +23,7 @@ _MAX_GAP = 0.02  # seconds between a frame and its pose
 _MOST_BETWEEN = 10.0  # metres between the two cameras of a rig; more is taken for millimetres
 NO_POSE = Assumption("no pose: the capture has none of the frame")
 USUAL_SIZE = (1440, 1920)  # height and width of iPhones' photos, for photos that were made smaller
+_OPEN3D_FILES = ("scene/trajectory.log", "trajectory.log")
 _ARKIT_TO_DSR = np.diag([1.0, -1.0, -1.0, 1.0])  # ARKit's and OpenGL's camera looks along -z with y up; dsr's along z
 
 
@@ -249,3 +251,47 @@ def describe_capture(app: str, unit: str, pairs: Sequence[Pair], *, poses: bool)
     parts = ["intrinsics", *(["poses"] if poses else [])]
     parts += ["confidence"] if any(pair.confidence is not None for pair in pairs) else []
     return Assumption(f"{app}: depth in {unit}; from the capture: {', '.join(parts)}")
+
+
+def add_trajectory(folder: Path, found: PairingResult) -> PairingResult:
+    """Return the pairs of a folder with the poses of the trajectory of Open3D's reconstruction system, if it fits.
+
+    That is a line of three whole numbers and the four rows of the pose for each frame
+    (http://redwood-data.org/indoor/fileformat.html): the n-th pose, by the first of the three, is of the n-th photo.
+    """
+    path = next((folder / name for name in _OPEN3D_FILES if (folder / name).is_file()), None)
+    if path is None or not found.pairs:
+        return found
+    entries = _read_log(path)
+    if found.unpaired or len(entries) != len(found.pairs):
+        text = f"no poses: {path.name} has {len(entries)}, for {len(found.pairs)} pairs"
+        text += f" and {len(found.unpaired)} pictures without a partner" if found.unpaired else ""
+        return replace(found, assumptions=(*found.assumptions, Assumption(text)))
+    pairs: list[Pair] = []
+    for rank, (pair, rows) in enumerate(zip(found.pairs, entries, strict=True)):
+        geometry = stated(_geometry_of_log, f"{path}: pose {rank}", rows)
+        pairs.append(replace(pair, capture=CaptureFrame("Open3D", geometry, path, "\n".join(rows).encode())))
+    text = f"poses: {path.relative_to(folder).as_posix()} of Open3D, one for each photo"
+    return replace(found, pairs=tuple(pairs), assumptions=(*found.assumptions, Assumption(text)))
+
+
+def _read_log(path: Path) -> list[tuple[str, ...]]:
+    """Return the four rows of each pose as text, in the order of the poses' numbers."""
+    lines = [line for line in read_text(path).splitlines() if line.strip()]
+    try:
+        if len(lines) % 5 or any(len(line.split()) != 3 for line in lines[::5]):
+            raise ValueError
+        order = order_of([int(line.split()[0]) for line in lines[::5]])
+    except ValueError:
+        raise ValueError(
+            f"{path}: expected a line of three whole numbers and four of a matrix for each pose, got {len(lines)} lines"
+        ) from None
+    return [tuple(lines[5 * place + 1 : 5 * place + 5]) for place in order]
+
+
+def _geometry_of_log(place: str, rows: tuple[str, ...]) -> Geometry:
+    """Return the pose of a frame; its camera is read from the file beside the pictures."""
+    values = [numbers_in(row.split()) for row in rows]
+    if [len(row) for row in values] != [4] * 4:
+        raise ValueError(f"{place}: expected a matrix of 4 x 4 numbers, got {' '.join(rows)!r:.80}")
+    return Geometry(None, check_pose(place, np.array(values)))

@@ -13,7 +13,7 @@ import numpy as np
 
 from dsr.geometry.camera import Camera, RangeType, baseline_times_focal
 from dsr.geometry.planes import InverseVotes, inverse_votes
-from dsr.io.encoding import expect_known
+from dsr.io.depth_files import expect_known
 from dsr.io.reading import SUNRGBD_BITS
 from dsr.notes import LIMITS, Assumption
 from dsr.utils.progress import show_length
