@@ -74,10 +74,14 @@ def write_depth_file(path: Path, values: np.ndarray) -> None:
         elif suffix == ".npz":
             np.savez_compressed(temporary, depth=values)
         elif suffix == ".pfm":
-            header = f"Pf\n{values.shape[1]} {values.shape[0]}\n-1.0\n".encode()
-            temporary.write_bytes(header + values[::-1].astype("<f4").tobytes())
+            size = f"Pf\n{values.shape[1]} {values.shape[0]}\n-1.0\n".encode()
+            temporary.write_bytes(size + values[::-1].astype("<f4").tobytes())
         elif suffix == ".exr":
-            _write_exr(temporary, values)
+            import OpenEXR  # noqa: PLC0415 - only where somebody has such a file
+
+            header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+            with OpenEXR.File(header, {"Z": np.ascontiguousarray(values)}) as file:
+                file.write(str(temporary))
         else:
             predictor = 3 if values.dtype.kind == "f" else 2
             how = {".png": [cv2.IMWRITE_PNG_COMPRESSION, 6]}.get(suffix, [_COMPRESSION, 8, _PREDICTOR, predictor])
@@ -98,37 +102,19 @@ def storable(suffix: str, dtype: np.dtype) -> np.dtype:
     return dtype if can_hold(suffix, dtype) or not alike else max(alike, key=lambda each: each.itemsize)
 
 
-def _write_exr(path: Path, values: np.ndarray) -> None:
-    """Write one channel, Z."""
-    import OpenEXR  # noqa: PLC0415 - as above
-
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, {"Z": np.ascontiguousarray(values)}) as file:
-        file.write(str(path))
-
-
 @dataclass(frozen=True)
 class Encoding:
-    """How the values of a depth file are stored.
+    """How the values of a depth file are stored."""
 
-    Args:
-        suffix: suffix of the file's format, such as ``.png``.
-        dtype: NumPy's name of the type of the values.
-        unit: metres per value; pixels per value for disparities.
-        hole: value that is written for a hole: 0, NaN, inf or another.
-        range_type: quantity that the values measure.
-
-    """
-
-    suffix: str
-    dtype: str
-    unit: float
-    hole: float
+    suffix: str  # of the file's format, such as .png
+    dtype: str  # NumPy's name of the type of the values
+    unit: float  # metres per value; pixels per value for disparities
+    hole: float  # value that is written for a hole: 0, NaN, inf or another
     range_type: RangeType
 
 
+# How results are stored to the bit: as the distance to the camera's plane in metres, NaN in holes.
 IN_METRES = Encoding(".tiff", "float32", 1.0, math.nan, "orthogonal")
-"""How results are stored to the bit: as the distance to the camera's plane in metres, NaN in holes."""
 
 
 def turn_back_bits(name: str, values: np.ndarray, bits: int) -> np.ndarray:

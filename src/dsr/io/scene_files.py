@@ -38,26 +38,15 @@ _POINTS = 100_000  # of all frames together, from which an optimisation starts
 
 @dataclass(frozen=True)
 class Frame:
-    """A photo and a depth map of one size.
+    """A photo and a depth map of one size."""
 
-    Args:
-        name: the frame's, perhaps with folders: ``kitchen/000012``.
-        camera: of the pixels.
-        pose: (4, 4) float64 camera-to-world transform in metres; None if it is not known.
-        colour: an 8-bit PNG.
-        depth: a file of (H, W) orthogonal depth in metres, NaN in holes.
-        up: the axis of the world that points up, one of :data:`dsr.io.frames.UPS`.
-        time: of the frame in seconds; None if it is not known.
-
-    """
-
-    name: str
+    name: str  # perhaps with folders: kitchen/000012
     camera: Camera
-    pose: Tensor | None
-    colour: Path
-    depth: Path
-    up: str = ""
-    time: float | None = None
+    pose: Tensor | None  # (4, 4) float64 camera to world in metres; None if it is not known
+    colour: Path  # an 8-bit PNG
+    depth: Path  # a file of (H, W) orthogonal depth in metres, NaN in holes
+    up: str = ""  # the axis of the world that points up, one of dsr.io.frames.UPS
+    time: float | None = None  # in seconds
 
     @property
     def stem(self) -> str:

@@ -29,20 +29,12 @@ _ARKIT_TO_DSR = np.diag([1.0, -1.0, -1.0, 1.0])  # ARKit's and OpenGL's camera l
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses in a file.
-
-    Args:
-        file: the file.
-        poses: camera to world, 4 x 4, metres, in order; None where tracking was lost: NaN, infinite or all 0.
-        times: time of each in seconds, or its frame's number; None where the file has none.
-        ids: number of each frame, RTAB-Map's ninth column; None where the file has none.
-
-    """
+    """Poses in a file."""
 
     file: Path
-    poses: tuple[Matrix | None, ...]
-    times: tuple[float, ...] | None = None
-    ids: tuple[float, ...] | None = None
+    poses: tuple[Matrix | None, ...]  # camera to world, metres; None where tracking was lost: NaN, infinite or all 0
+    times: tuple[float, ...] | None = None  # of each in seconds, or its frame's number; None where the file has none
+    ids: tuple[float, ...] | None = None  # number of each frame, RTAB-Map's ninth column
 
     def assign(self, pairs: Sequence[Pair]) -> Mapping[str, Matrix]:
         """Return the poses of frames by their names, without those of frames that have none.

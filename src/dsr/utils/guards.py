@@ -40,8 +40,8 @@ _MOST_DIGITS = 300  # of a whole number that a float can still hold
 _LONGEST = 100  # characters of a name that a message shows
 _TURNS = re.compile("([0-9]+|/)")
 _WITH_COMMA = re.compile(r"[-+]?(\d+(,\d+)?(e[-+]?\d+)?|nan|inf)", re.ASCII | re.IGNORECASE)
-# Texts and numbers of a name in turns, numbers as their number of digits and the digits, ``/`` as -1; and the name.
-NaturalKey = tuple[tuple[str | tuple[int, str], ...], str]
+# Limits of a container's memory (cgroup version 2 and 1), of which there are none on a machine as such.
+_CONTAINER = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 _Record = TypeVar("_Record")
 
 
@@ -173,12 +173,15 @@ def expect_memory(name: str, value: object, needed: float) -> None:
 
 
 def _meminfo(name: str) -> int:
-    """Return an entry of Linux's ``/proc/meminfo``, in bytes."""
-    try:
+    """Return an entry of Linux's ``/proc/meminfo`` in bytes, or the limit of this container's memory if it is less."""
+    sizes = [_NO_LIMIT]
+    with contextlib.suppress(OSError, ValueError, StopIteration):
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(name))
-    except (OSError, ValueError, StopIteration):
-        return _NO_LIMIT
+        sizes.append(1024 * next(int(line.split()[1]) for line in lines if line.startswith(name)))
+    for path in _CONTAINER:
+        with contextlib.suppress(OSError, ValueError):  # without a limit the text is "max"
+            sizes.append(int(Path(path).read_text(encoding="ascii")))
+    return min(sizes)
 
 
 @contextlib.contextmanager
@@ -312,8 +315,11 @@ def path_within(folder: Path, name: str, source: object, form: str = "{}") -> Pa
     return path
 
 
-def natural_key(name: str | PurePath) -> NaturalKey:
-    """Return a key that sorts names, or paths folder by folder, with the numbers in them by value: 2 before 10."""
+def natural_key(name: str | PurePath) -> tuple[tuple[str | tuple[int, str], ...], str]:
+    """Return a key that sorts names, or paths folder by folder, with the numbers in them by value: 2 before 10.
+
+    It has texts and numbers in turns, numbers as how many digits they have and the digits, ``/`` as -1; and the name.
+    """
     text = str(name).replace(os.sep, "/")
     parts: list[str | tuple[int, str]] = list(_TURNS.split(text))
     for place in range(1, len(parts), 2):
