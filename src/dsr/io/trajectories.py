@@ -44,9 +44,9 @@ class Trajectory:
         frames, the first of these if several do. Those of frames without times are else taken in order.
         """
         if self.times is not None:
-            named = _known([pair.named_time for pair in pairs])
-            own = _known([pair.time for pair in pairs])
-            numbers = _known([_number(pair) for pair in pairs])
+            named = np.array([pair.named_time for pair in pairs], np.float64)  # None becomes NaN
+            own = np.array([pair.time for pair in pairs], np.float64)
+            numbers = np.array([_number(pair) for pair in pairs], np.float64)
             ways = [(own, _MAX_GAP), *(way for way in ((named, _MAX_GAP), (numbers, 0.0)) if np.isfinite(way[0]).all())]
             found = [self._nearest(pairs, *way) for way in ways]
             if self.ids is not None:
@@ -180,11 +180,6 @@ def _matrix_of_json(path: Path, text: str) -> list[list[float]]:
     return content
 
 
-def _known(times: Sequence[float | None]) -> np.ndarray:
-    """Return times, (frames,) float64, NaN where there is none."""
-    return np.array([math.nan if time is None else time for time in times], dtype=np.float64)
-
-
 def _number(pair: Pair) -> float | None:
     """Return the last number in a frame's name; None if it is the fraction of a time."""
     numbers = re.findall(r"\d+", pair.depth.stem)
@@ -254,21 +249,6 @@ def add_trajectory(folder: Path, found: PairingResult) -> PairingResult:
     path = next((folder / name for name in _OPEN3D_FILES if (folder / name).is_file()), None)
     if path is None or not found.pairs:
         return found
-    entries = _read_log(path)
-    if found.unpaired or len(entries) != len(found.pairs):
-        text = f"no poses: {path.name} has {len(entries)}, for {len(found.pairs)} pairs"
-        text += f" and {len(found.unpaired)} pictures without a partner" if found.unpaired else ""
-        return replace(found, assumptions=(*found.assumptions, Assumption(text)))
-    pairs: list[Pair] = []
-    for rank, (pair, rows) in enumerate(zip(found.pairs, entries, strict=True)):
-        geometry = stated(_geometry_of_log, f"{path}: pose {rank}", rows)
-        pairs.append(replace(pair, capture=CaptureFrame("Open3D", geometry, path, "\n".join(rows).encode())))
-    text = f"poses: {path.relative_to(folder).as_posix()} of Open3D, one for each photo"
-    return replace(found, pairs=tuple(pairs), assumptions=(*found.assumptions, Assumption(text)))
-
-
-def _read_log(path: Path) -> list[tuple[str, ...]]:
-    """Return the four rows of each pose as text, in the order of the poses' numbers."""
     lines = [line for line in read_text(path).splitlines() if line.strip()]
     try:
         if len(lines) % 5 or any(len(line.split()) != 3 for line in lines[::5]):
@@ -278,7 +258,17 @@ def _read_log(path: Path) -> list[tuple[str, ...]]:
         raise ValueError(
             f"{path}: expected a line of three whole numbers and four of a matrix for each pose, got {len(lines)} lines"
         ) from None
-    return [tuple(lines[5 * place + 1 : 5 * place + 5]) for place in order]
+    if found.unpaired or len(order) != len(found.pairs):
+        text = f"no poses: {path.name} has {len(order)}, for {len(found.pairs)} pairs"
+        text += f" and {len(found.unpaired)} pictures without a partner" if found.unpaired else ""
+        return replace(found, assumptions=(*found.assumptions, Assumption(text)))
+    pairs: list[Pair] = []
+    for rank, (pair, place) in enumerate(zip(found.pairs, order, strict=True)):
+        rows = tuple(lines[5 * place + 1 : 5 * place + 5])
+        geometry = stated(_geometry_of_log, f"{path}: pose {rank}", rows)
+        pairs.append(replace(pair, capture=CaptureFrame("Open3D", geometry, path, "\n".join(rows).encode())))
+    text = f"poses: {path.relative_to(folder).as_posix()} of Open3D, one for each photo"
+    return replace(found, pairs=tuple(pairs), assumptions=(*found.assumptions, Assumption(text)))
 
 
 def _geometry_of_log(place: str, rows: tuple[str, ...]) -> Geometry:

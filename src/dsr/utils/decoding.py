@@ -41,12 +41,7 @@ def decode_pixels(place: str | Path, content: bytes, flags: int, most: int | Non
     """Return the pixels of an encoded picture as OpenCV decodes them; None if it is damaged or none.
 
     With IMREAD_UNCHANGED, holes of a TIFF of GDAL are 0 or NaN, and grey with opacity has one channel if it is opaque.
-
-    Args:
-        place: its name, for messages.
-        content: a PNG, JPEG, TIFF, BMP, WebP or portable map.
-        most: largest number of pixels; None for what its length explains.
-
+    A message begins with ``place``. ``most``: largest number of pixels; None for what the length explains.
     """
     size = picture_size(io.BytesIO(content))
     if size is None:
@@ -95,10 +90,7 @@ def _only_page(place: str | Path, content: bytes, flags: int) -> tuple[bytes, fl
 
 
 class _QuietStderr:
-    """A context in which stderr is discarded, so that messages of decoders (libpng, OpenCV) are not shown.
-
-    Threads may be in it at the same time: the first redirects stderr and the last restores it.
-    """
+    """A context without messages of decoders: its first thread redirects stderr, and its last one restores it."""
 
     def __init__(self) -> None:
         self._lock, self._within, self._kept = threading.Lock(), 0, -1
@@ -120,7 +112,6 @@ class _QuietStderr:
 
 
 QUIET_DECODERS = _QuietStderr()
-"""A context in which messages of decoders about damaged files are not shown."""
 
 
 def picture_size(file: IO[bytes]) -> tuple[int, int] | None:
@@ -143,14 +134,11 @@ def picture_size(file: IO[bytes]) -> tuple[int, int] | None:
 
 
 class TiffPage(NamedTuple):
-    """A page of a TIFF: the places of its directory and of its orientation (0 for none) in the file, and its tags.
+    """A page of a TIFF."""
 
-    Of a tag that is there twice, the larger values count; texts are their bytes.
-    """
-
-    at: int
-    orientation_at: int
-    tags: dict[int, tuple[int, ...]]
+    at: int  # place of its directory in the file
+    orientation_at: int  # place of its orientation, 0 for none
+    tags: dict[int, tuple[int, ...]]  # the larger values of one that is there twice; texts are their bytes
 
 
 def tiff_pages(file: IO[bytes]) -> list[TiffPage]:
