@@ -1,8 +1,6 @@
 """Cases: a number and a seed are a reader, its files with something changed, and how reading them ends."""
 
-import contextlib
 import os
-import resource
 import shutil
 import signal
 import tempfile
@@ -18,19 +16,8 @@ from fuzz.mutations import mutate
 from fuzz.readers import OF_CAPTURES, OF_FILES, OF_SETS, Reader
 
 READERS = (*OF_CAPTURES, *OF_SETS, *OF_FILES, *COMMANDS)
-_ADDRESSES = 6 << 30  # Bytes that a case may take beyond those of an idle worker, so that the machine is left alone
-_ROUND = tuple(reader for turn in range(6) for reader in READERS if reader.weight > turn)
-"""The readers of consecutive cases."""
-
-
-def reader_of(number: int) -> Reader:
-    """Return the reader of a case."""
-    return _ROUND[number % len(_ROUND)]
-
-
-def numbers_of(reader: Reader) -> list[int]:
-    """Return the numbers of the cases of a reader in the first round."""
-    return [number for number, each in enumerate(_ROUND) if each is reader]
+# The readers of consecutive cases.
+ROUND = tuple(reader for turn in range(6) for reader in READERS if reader.weight > turn)
 
 
 @dataclass(frozen=True)
@@ -39,14 +26,17 @@ class Case:
 
     seed: int
     number: int
-    reader: str
     changes: tuple[str, ...]
     outcome: Outcome
 
+    @property
+    def reader(self) -> Reader:
+        """The reader of the case."""
+        return ROUND[self.number % len(ROUND)]
+
     def __str__(self) -> str:
-        what = ", ".join(self.changes)
         return (
-            f"{self.reader}: {self.outcome.text}\n    of {what or 'valid files'}\n"
+            f"{self.reader.name}: {self.outcome.text}\n    of {', '.join(self.changes) or 'valid files'}\n"
             f'    again: make fuzz ARGS="--seed {self.seed} --case {self.number} --keep DIR"'
         )
 
@@ -64,17 +54,18 @@ class Cases:
 
     def run(self, number: int, keep: Path | None = None) -> Case:
         """Run a case in the working directory, which should be an empty one; ``keep`` is a new folder for its files."""
-        reader, random = reader_of(number), Random(f"{self._seed}-{number}")
+        reader, random = ROUND[number % len(ROUND)], Random(f"{self._seed}-{number}")
         place = self._place(f"case{number}", self._seeds(reader))
         changes = mutate(random, place, lambda: self._other(random))
-        if keep is not None:
-            shutil.copytree(place.input, keep, symlinks=True, copy_function=_copy)
+        if keep is not None:  # named pipes are left out
+            copy = lambda source, target: shutil.copy2(source, target) if Path(source).is_file() else target  # noqa: E731
+            shutil.copytree(place.input, keep, symlinks=True, copy_function=copy)
         try:
             outcome = judge(reader.read, place)
         finally:
             for folder in (place.root, place.canary):
                 shutil.rmtree(folder, ignore_errors=True)
-        return Case(self._seed, number, reader.name, tuple(changes), outcome)
+        return Case(self._seed, number, tuple(changes), outcome)
 
     def _place(self, name: str, seeds: Path) -> Place:
         place = Place(self.folder / name)
@@ -105,9 +96,6 @@ def begin(seed: int, work: Path) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends the workers
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     torch.set_num_threads(1)
-    with contextlib.suppress(ValueError, OSError), open("/proc/self/statm") as file:  # noqa: PTH123 - Linux's
-        most = int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE") + _ADDRESSES
-        resource.setrlimit(resource.RLIMIT_AS, (most, most))
     _cases = Cases(seed, work)
     os.chdir(_cases.folder)
 
@@ -118,8 +106,3 @@ def run(number: int, keep: Path | None) -> Case:
 
 
 _cases: Cases
-
-
-def _copy(source: str, target: str) -> str:
-    """Copy a file that is one; named pipes are left out."""
-    return shutil.copy2(source, target) if Path(source).is_file() else target

@@ -130,14 +130,6 @@ def test_transforms_are_read_as_nerfstudio_reads_them(make, tmp_path, second):
     assert ("fl_x" in first) == (second == CAMERA)
 
 
-def test_transforms_of_different_cameras_have_intrinsics_for_each_frame(make, tmp_path):
-    frames = [make(0), make(1, camera=Camera(12, 8, 20.0, 21.0, 5.25, 3.5))]
-    write_transforms(tmp_path / "t.json", frames)
-    entries = json.loads((tmp_path / "t.json").read_text())
-    assert "fl_x" not in entries
-    assert [each["fl_x"] for each in entries["frames"]] == [10, 20]
-
-
 @pytest.mark.parametrize(("part", "write"), [("nerfstudio", write_transforms), ("gaussian", write_splatting)])
 def test_frames_without_poses_are_refused_in_one_line(make, tmp_path, part, write):
     with pytest.raises(ValueError, match=rf"^{part}: expected a pose of each frame, got none for 1 of 2, .*room/001"):
