@@ -59,7 +59,7 @@ class _Payload:
         self._what, self._canary = what, str(canary)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        code = f"import os\nos.makedirs({self._canary!r}, exist_ok=True)\n{MARK} = 1"
+        code = f"import os\nos.makedirs({self._canary!r}, exist_ok=True)"
         return (
             (os.mkdir, (self._canary,)),
             (os.system, (f"mkdir -p '{self._canary}'",)),

@@ -179,6 +179,7 @@ def test_pipe_that_nobody_writes_to_is_not_waited_for(tmp_path, read):
 
 DAMAGES = {
     "missing": None,
+    "pipe": None,
     "empty": lambda _: b"",
     "text": lambda _: b"neither numbers nor a picture",
     "zeros": lambda _: bytes(200),
@@ -198,7 +199,9 @@ def test_damaged_file_is_refused_in_one_line_that_names_it_and_nothing_is_printe
         return
     content = path.read_bytes()
     path.unlink()
-    if damage != "missing":
+    if damage == "pipe":
+        os.mkfifo(path)
+    elif damage != "missing":
         path.write_bytes(DAMAGES[damage](content))
     capfd.readouterr()
     with pytest.raises((ValueError, OSError)) as caught:

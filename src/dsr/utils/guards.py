@@ -31,7 +31,6 @@ MOST_FACES, MOST_POINTS = 25_000_000, 20_000_000  # triangles and points that ar
 _PIXELS, _PIXELS_PER_BYTE = 1 << 25, 64  # that any file may have, and that each byte of a larger one explains (JPEG 20)
 _UNPACKED, _RATIO = 1 << 28, 16  # bytes that any archive of arrays may unpack to, and that each byte of it explains
 _PER_PHOTO, _FLOOR = 4, 1 << 22  # pixels of a map for each of its photo's, and pixels that any photo explains
-_CHUNK = 1 << 20
 _TOO_LITTLE = "not enough memory; a smaller size, scale or batch, or fewer workers need less"
 _NO_LIMIT = 1 << 40  # bytes of memory assumed where the system does not report them
 _MOST_NEEDED = 1e300  # bytes that a message can still name
@@ -126,20 +125,16 @@ def files_in(packed: zipfile.ZipFile, archive: object) -> list[zipfile.ZipInfo]:
 
 
 def read_member(packed: zipfile.ZipFile, name: str) -> bytes:
-    """Return a member of an archive, in no more memory than the size that the archive declares for it.
+    """Return a member of an archive, in no more memory than the size that it declares, which the caller checks.
 
-    The caller checks that size. A member that unpacks to more, which :meth:`zipfile.ZipFile.read` would unpack whole
-    before it cuts it off, is damaged.
+    A member that unpacks to more, of which :meth:`zipfile.ZipFile.read` would unpack all, is damaged.
     """
     declared = packed.getinfo(name).file_size
-    parts, length = [], 0
     with packed.open(name) as member:
-        while part := member.read(_CHUNK):
-            parts.append(part)
-            length += len(part)
-    if length != declared:
-        raise zipfile.BadZipFile(f"{name}: {length} bytes instead of {declared}")
-    return b"".join(parts)
+        content = member.read(declared)
+    if len(content) != declared:
+        raise zipfile.BadZipFile(f"{name}: {len(content)} bytes instead of {declared}")
+    return content
 
 
 class OutOfMemoryError(ValueError):
