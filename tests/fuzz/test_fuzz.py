@@ -3,24 +3,23 @@
 import dataclasses
 import os
 import pickle
-import shutil
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 from random import Random
 
 import numpy as np
 import pytest
+import torch
 
 from dsr.io.captures.contract import Capture
 from dsr.io.captures.registry import CAPTURES
 from fuzz import judging, readers
-from fuzz.cases import READERS, ROUND, Cases
+from fuzz.cases import READERS, Cases
 from fuzz.guard import MARK
 from fuzz.judging import Place, RefusedError, judge
 from fuzz.texts import pickled
-
-SEED = 2
 
 
 @pytest.fixture
@@ -105,17 +104,20 @@ def test_every_capture_of_the_registry_that_recognises_its_files_is_asked(tmp_pa
 
 
 @pytest.fixture(scope="module")
-def cases():
+def cases(request, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DSR_CACHE", "")  # what it was comes back
-        made = Cases(SEED)
-        patch.chdir(made.folder)
-        yield made
-        shutil.rmtree(made.folder)
+        patch.chdir(tmp_path_factory.mktemp("fuzz"))
+        torch.set_num_threads(1)
+        yield Cases(request.config.getoption("--seed", 2), Path.cwd())
 
 
 @pytest.mark.parametrize("reader", READERS, ids=[reader.name.replace(" ", "_") for reader in READERS])
-def test_reader_ends_with_a_value_or_lines_that_name_the_file(cases, reader):
-    done = [cases.run(number) for number, each in enumerate(ROUND) if each is reader]
+def test_reader_ends_with_a_value_or_lines_that_name_the_file(cases, reader, request):
+    rounds, case, keep = (request.config.getoption(name, None) for name in ("--rounds", "--case", "--keep"))
+    numbers = range(reader.weight * (rounds or 1)) if case is None else [case]
+    folders = [None if keep is None else request.config.invocation_params.dir / keep / reader.name / f"{number}"
+               for number in numbers]  # fmt: skip
+    unclean = [cases.run(reader, number, folder) for number, folder in zip(numbers, folders, strict=True)]
     assert cases.of_valid_files[reader.name].kind == "value", cases.of_valid_files[reader.name].text
-    assert [str(case) for case in done if case.outcome.kind == "unclean"] == []
+    assert list(filter(None, unclean)) == []

@@ -12,7 +12,7 @@ import numpy as np
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.plausible import may_be_of
-from dsr.geometry.poses import Matrix, as_rigid, from_quaternion, is_rotation
+from dsr.geometry.poses import Matrix, as_rigid, from_quaternion
 from dsr.io.frames import CaptureFrame, Geometry, stated
 from dsr.io.pairs import Pair, PairingResult
 from dsr.notes import Assumption
@@ -196,18 +196,15 @@ def pose_from_quaternion(
     ``source`` is the file and the place in it. ``opengl``: the camera's axes are x right, y up, z backward, as ARKit
     and OpenGL have them, in place of x right, y down, z forward.
     """
-    came = " ".join(f"{value:g}" for value in (*quaternion, *position))
-    with refusing(f"{source}: expected a rigid pose (a quaternion of length 1 and a position), got {came}", ValueError):
-        pose = from_quaternion(position, quaternion, source)
+    pose = from_quaternion(position, quaternion, source)
     return pose @ _ARKIT_TO_DSR if opengl else pose
 
 
 def check_pose(source: str, matrix: np.ndarray, *, opengl: bool = False) -> np.ndarray:
     """Return a rigid transform (4, 4) from camera to world as it is; see :func:`pose_from_quaternion`."""
-    finite = matrix.shape == (4, 4) and bool(np.isfinite(matrix).all())
-    if not finite or not is_rotation(matrix[:3, :3]) or not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
-        came = " ".join(f"{value:.4g}" for value in matrix.ravel())
-        raise ValueError(f"{source}: expected a rigid pose (a rotation and a position), got {came}")
+    if matrix.shape != (4, 4):
+        raise ValueError(f"{source}: expected a matrix of 4 x 4 numbers, got {' x '.join(map(str, matrix.shape))}")
+    as_rigid(matrix, source)
     return matrix @ _ARKIT_TO_DSR if opengl else matrix
 
 
