@@ -151,8 +151,8 @@ def write_cloud(
     """
     mesh = triangulate(depth, camera, isolated=True)
     chosen, normals = select_points(mesh, most, camera), vertex_normals(mesh)
-    pixels = mesh.pixels[chosen]
-    write_ply(path, mesh.vertices[chosen], _colours(rgb, pixels), normals[chosen], filled=_at(filled, pixels))
+    colours, flags = _at(mesh.pixels[chosen], rgb, filled)
+    write_ply(path, mesh.vertices[chosen], colours, normals[chosen], filled=flags)
     fewer = len(chosen) < len(mesh.vertices)
     return Written(len(mesh.vertices), len(chosen), "leaving out rows and columns" if fewer else "")
 
@@ -187,13 +187,13 @@ def write_mesh(
         except ImportError:
             mesh, stride = thin(depth, camera, most)
             how = f"a stride of {stride} pixels; {how_to_install('mesh')} simplifies and keeps more detail"
-    normals, missing = vertex_normals(mesh), _at(filled, mesh.pixels)
+    normals, (colours, flags) = vertex_normals(mesh), _at(mesh.pixels, rgb, filled)
     for path in paths:
         if path.suffix.lower() == ".ply":
-            write_ply(path, mesh.vertices, _colours(rgb, mesh.pixels), normals, mesh.faces, filled=missing)
+            write_ply(path, mesh.vertices, colours, normals, mesh.faces, filled=flags)
         else:
             places, photo = project(mesh.vertices, camera), _bytes(rgb).transpose(1, 2, 0).copy()
-            write_glb(path, mesh.vertices, normals, mesh.faces, places, photo, missing)
+            write_glb(path, mesh.vertices, normals, mesh.faces, places, photo, flags)
     return Written(before, len(mesh.faces), how)
 
 
@@ -295,14 +295,10 @@ class _Glb:
         return struct.pack("<4sII", b"glTF", 2, 12 + len(parts)) + parts
 
 
-def _at(mask: Tensor | None, pixels: np.ndarray) -> np.ndarray | None:
-    """Return a mask's values at some pixels, (N,) bool; ``pixels`` are indices of the flattened map."""
-    return None if mask is None else mask.flatten().cpu().numpy()[pixels]
-
-
-def _colours(rgb: Tensor, pixels: np.ndarray) -> np.ndarray:
-    """Return the photo's colours at some pixels, (N, 3) uint8; ``pixels`` are indices of the flattened map."""
-    return _bytes(rgb.flatten(1)[:, torch.from_numpy(pixels)]).T
+def _at(pixels: np.ndarray, rgb: Tensor, filled: Tensor | None) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return colours, (N, 3) uint8, and values of a mask, (N,) bool, at some pixels, indices of the flattened map."""
+    flags = None if filled is None else filled.flatten().cpu().numpy()[pixels]
+    return _bytes(rgb.flatten(1)[:, torch.from_numpy(pixels)]).T, flags
 
 
 def _bytes(values: Tensor) -> np.ndarray:
