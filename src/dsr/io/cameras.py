@@ -265,14 +265,12 @@ def read_rig(files: RigFiles, size_lr: Size, baseline: float | None) -> Rig:
 
     ``baseline``: metres between the two cameras of disparities, if the map has such.
     """
-    height, width = size_lr
     content = read_any_camera(files.camera)
     if isinstance(content, np.ndarray):
-        camera = Camera(width, height, content[0, 0], content[1, 1], content[0, 2], content[1, 2], baseline)
+        camera = Camera(size_lr[1], size_lr[0], content[0, 0], content[1, 1], content[0, 2], content[1, 2])
     else:
         camera = scale_camera(files.camera, content.camera, size_lr)
-    own = camera.baseline if baseline is None else baseline
-    camera = Camera(width, height, camera.fx, camera.fy, camera.cx, camera.cy, own, camera.doffs)
+    camera = camera if baseline is None else replace(camera, baseline=baseline)
     return Rig(camera, read_transform(files.extrinsics))
 
 
