@@ -2,7 +2,7 @@
 # make test  lint, types and tests: what a change must pass
 # make test-all  these and the nightly ones: campaigns, real Slurm, published peers, further ways to interrupt
 # make unit  the unit tests alone, about a minute
-# make fuzz  10,000 damaged, foreign and malicious files for every reader (ARGS="--cases 1000 --seed 1")
+# make fuzz  10,000 damaged, foreign and malicious files for every reader (ARGS="--rounds 3 --seed 1 -k polycam")
 # make chaos commands that are killed and run at once (ARGS="--kills 100 --seed 0")
 # make mistakes  inputs that can be computed with and are wrong: which are told (ARGS="--cases 500 --seed 0")
 # make benchmark  speed ratios: dsr against plain implementations (ARGS="--json before.json")
@@ -34,7 +34,7 @@ unit: $(VENV)/installed-dev
 	$(PYTEST) -m unit
 
 fuzz: $(VENV)/installed-dev
-	OMP_NUM_THREADS=1 PYTHONPATH=$(CURDIR)/tests nice -n 10 $(BIN)/python -m fuzz $(ARGS)
+	OMP_NUM_THREADS=1 nice -n 10 $(BIN)/python -m pytest --numprocesses 2 --rounds 33 tests/fuzz/test_fuzz.py $(ARGS)
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .

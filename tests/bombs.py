@@ -1,11 +1,14 @@
-"""Small files that unpack to gigabytes, or whose headers say so."""
+"""Small files that unpack to gigabytes, or whose headers say so, and a limit of memory as commands have it."""
 
+import contextlib
 import io
 import json
 import os
+import resource
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +17,20 @@ import numpy as np
 
 LARGE = 600 << 20  # Bytes, more than a refusal may take
 CHUNK = 1 << 24
+
+
+@contextlib.contextmanager
+def limited_memory(most: int) -> Iterator[None]:
+    """Limit this process in the block to ``most`` bytes more than it has, on Linux."""
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/self/status").read_text().splitlines()
+        now = 1024 * int(next(line for line in lines if line.startswith("VmData")).split()[1])
+        resource.setrlimit(resource.RLIMIT_DATA, (now + most, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, before)
 
 
 def zeros(packed: zipfile.ZipFile, name: str, head: bytes, size: int) -> None:
@@ -81,49 +98,6 @@ def tiff(path: Path) -> None:
     path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + b"\0" * 64)
 
 
-def exr(path: Path) -> None:
-    """Write an OpenEXR file of 2^28 pixels, all 0."""
-    attributes = b"".join(
-        name + b"\0" + kind + b"\0" + struct.pack("<I", len(value)) + value
-        for name, kind, value in (
-            (b"channels", b"chlist", b"Z\0" + struct.pack("<iB3xii", 2, 0, 1, 1) + b"\0"),
-            (b"compression", b"compression", b"\3"),
-            (b"dataWindow", b"box2i", struct.pack("<4i", 0, 0, (1 << 14) - 1, (1 << 14) - 1)),
-            (b"displayWindow", b"box2i", struct.pack("<4i", 0, 0, (1 << 14) - 1, (1 << 14) - 1)),
-            (b"lineOrder", b"lineOrder", b"\0"),
-            (b"pixelAspectRatio", b"float", struct.pack("<f", 1)),
-            (b"screenWindowCenter", b"v2f", struct.pack("<2f", 0, 0)),
-            (b"screenWindowWidth", b"float", struct.pack("<f", 1)),
-        )
-    )
-    head = struct.pack("<II", 20000630, 2) + attributes + b"\0"
-    block = zlib.compress(b"\0" + b"\x80" * (16 * 4 * (1 << 14) - 1), 9)
-    count, length = (1 << 14) // 16, 8 + len(block)
-    start = len(head) + 8 * count
-    table = b"".join(struct.pack("<Q", start + number * length) for number in range(count))
-    blocks = b"".join(struct.pack("<ii", 16 * number, len(block)) + block for number in range(count))
-    path.write_bytes(head + table + blocks)
-
-
-def mat5(path: Path) -> None:
-    """Write a MATLAB 5 file with three compressed variables of 200 MB of zeros each."""
-
-    def element(kind: int, data: bytes) -> bytes:
-        return struct.pack("<II", kind, len(data)) + data + b"\0" * (-len(data) % 8)
-
-    count = 200 << 20
-    parts = []
-    for number in range(3):
-        head = element(6, struct.pack("<II", 6, 0)) + element(5, struct.pack("<2i", count // 8, 1))
-        head += element(1, b"depth%d" % number) + struct.pack("<II", 9, count)
-        packing = zlib.compressobj(1)
-        data = packing.compress(struct.pack("<II", 14, len(head) + count) + head)
-        data += b"".join(packing.compress(b"\0" * CHUNK) for _ in range(count // CHUNK))
-        data += packing.compress(b"\0" * (count % CHUNK)) + packing.flush()
-        parts.append(struct.pack("<II", 15, len(data)) + data)
-    path.write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM" + b"".join(parts))
-
-
 def mat73(path: Path) -> None:
     """Write an HDF5 file with a matrix of 2^28 elements, none of them stored."""
     with h5py.File(path, "w") as file:
@@ -141,11 +115,6 @@ def r3d(path: Path) -> None:
     for real in (struct.pack("<I", LARGE), struct.pack("<Q", LARGE)):  # in both headers
         content = content.replace(real, struct.pack("<I", 1000).ljust(len(real), b"\0"))
     path.write_bytes(content)
-
-
-def pipe(path: Path) -> None:
-    """Make a named pipe that nobody writes to."""
-    os.mkfifo(path)
 
 
 class Trap:

@@ -21,7 +21,7 @@ from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, save_network
 from dsr.report.study.key import Candidate, Key, Trial, read_key, write_key
-from dsr.utils.torch_files import read_torch_file
+from dsr.utils.arrays import read_torch_file
 
 DEPTH = np.linspace(1, 2, 48 * 64, dtype=np.float32).reshape(48, 64)
 NOISE = np.random.default_rng(0).integers(1, 60_000, (48, 64, 3)).astype(np.uint16)

@@ -1,16 +1,9 @@
-"""Cases: a number and a seed are a reader, its files with something changed, and how reading them ends."""
+"""Cases: a seed, a reader and a number are files with something changed, and how reading them ends."""
 
-import contextlib
 import os
-import resource
 import shutil
-import signal
-import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from random import Random
-
-import torch
 
 from fuzz.commands import COMMANDS
 from fuzz.judging import Outcome, Place, judge
@@ -18,73 +11,46 @@ from fuzz.mutations import mutate
 from fuzz.readers import OF_CAPTURES, OF_FILES, OF_SETS, Reader
 
 READERS = (*OF_CAPTURES, *OF_SETS, *OF_FILES, *COMMANDS)
-_ADDRESSES = 6 << 30  # Bytes that a case may take beyond those of an idle worker, so that the machine is left alone
-_ROUND = tuple(reader for turn in range(6) for reader in READERS if reader.weight > turn)
-"""The readers of consecutive cases."""
-
-
-def reader_of(number: int) -> Reader:
-    """Return the reader of a case."""
-    return _ROUND[number % len(_ROUND)]
-
-
-def numbers_of(reader: Reader) -> list[int]:
-    """Return the numbers of the cases of a reader in the first round."""
-    return [number for number, each in enumerate(_ROUND) if each is reader]
-
-
-@dataclass(frozen=True)
-class Case:
-    """What happened in a case: the changes of its files, and how reading them ended."""
-
-    seed: int
-    number: int
-    reader: str
-    changes: tuple[str, ...]
-    outcome: Outcome
-
-    def __str__(self) -> str:
-        what = ", ".join(self.changes)
-        return (
-            f"{self.reader}: {self.outcome.text}\n    of {what or 'valid files'}\n"
-            f'    again: make fuzz ARGS="--seed {self.seed} --case {self.number} --keep DIR"'
-        )
 
 
 class Cases:
-    """Makes and runs cases in a folder of its own, below ``above`` or among temporary files."""
+    """Makes and runs cases in a folder of its own, which should be the working directory and a new one."""
 
-    def __init__(self, seed: int, above: Path | None = None) -> None:
-        self.folder = Path(tempfile.mkdtemp(prefix="dsr-fuzz-", dir=above))
-        self._seed = seed
+    def __init__(self, seed: int, folder: Path) -> None:
+        self._seed, self._folder = seed, folder
         self.of_valid_files: dict[str, Outcome] = {}  # by reader
-        os.environ["DSR_CACHE"] = str(self.folder / "cache")
-        (self.folder / "etc").mkdir()
-        (self.folder / "etc" / "passwd").touch()  # ../../etc/passwd from the folder of a case's files
+        os.environ["DSR_CACHE"] = str(folder / "cache")
+        (folder / "etc").mkdir()
+        (folder / "etc" / "passwd").touch()  # ../../etc/passwd from the folder of a case's files
 
-    def run(self, number: int, keep: Path | None = None) -> Case:
-        """Run a case in the working directory, which should be an empty one; ``keep`` is a new folder for its files."""
-        reader, random = reader_of(number), Random(f"{self._seed}-{number}")
+    def run(self, reader: Reader, number: int, keep: Path | None = None) -> str:
+        """Return what is unclean in a case, empty if nothing; ``keep`` is a new folder for its files then."""
+        random = Random(f"{self._seed}-{reader.name}-{number}")
         place = self._place(f"case{number}", self._seeds(reader))
         changes = mutate(random, place, lambda: self._other(random))
-        if keep is not None:
-            shutil.copytree(place.input, keep, symlinks=True, copy_function=_copy)
+        if keep is not None:  # named pipes are left out
+            copy = lambda source, target: shutil.copy2(source, target) if Path(source).is_file() else target  # noqa: E731
+            shutil.copytree(place.input, keep, symlinks=True, copy_function=copy)
         try:
             outcome = judge(reader.read, place)
         finally:
             for folder in (place.root, place.canary):
                 shutil.rmtree(folder, ignore_errors=True)
-        return Case(self._seed, number, reader.name, tuple(changes), outcome)
+        if outcome.kind == "unclean":
+            return f"case {number} of {reader.name}, {', '.join(changes) or 'valid files'}: {outcome.text}"
+        if keep is not None:
+            shutil.rmtree(keep)
+        return ""
 
     def _place(self, name: str, seeds: Path) -> Place:
-        place = Place(self.folder / name)
+        place = Place(self._folder / name)
         shutil.copytree(seeds, place.input)
         place.out.mkdir()
         return place
 
     def _seeds(self, reader: Reader) -> Path:
         """Return the folder of a reader's valid files, which is made and read once: readers import when they read."""
-        folder = self.folder / "seeds" / f"{READERS.index(reader)}"
+        folder = self._folder / "seeds" / f"{READERS.index(reader)}"
         if not folder.is_dir():
             folder.mkdir(parents=True)
             reader.make(folder)
@@ -97,29 +63,3 @@ class Cases:
         """Return the content of a file of any reader that is cheap to make."""
         folder = self._seeds(random.choice([each for each in READERS if each.weight > 1]))
         return random.choice(sorted(path for path in folder.rglob("*") if path.is_file())).read_bytes()
-
-
-def begin(seed: int, work: Path) -> None:
-    """Prepare a worker process."""
-    global _cases  # noqa: PLW0603 - of this process
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends the workers
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    torch.set_num_threads(1)
-    with contextlib.suppress(ValueError, OSError), open("/proc/self/statm") as file:  # noqa: PTH123 - Linux's
-        most = int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE") + _ADDRESSES
-        resource.setrlimit(resource.RLIMIT_AS, (most, most))
-    _cases = Cases(seed, work)
-    os.chdir(_cases.folder)
-
-
-def run(number: int, keep: Path | None) -> Case:
-    """Run a case in a worker process that has begun."""
-    return _cases.run(number, keep)
-
-
-_cases: Cases
-
-
-def _copy(source: str, target: str) -> str:
-    """Copy a file that is one; named pipes are left out."""
-    return shutil.copy2(source, target) if Path(source).is_file() else target

@@ -14,11 +14,9 @@ import captures
 import numpy as np
 import small_results
 from conftest import write_run
-from omegaconf import DictConfig
 from small_files import written
 
-from dsr.app.entry import run_command, run_eval, run_train
-from dsr.app.schema import EvalConfig, plain_config
+from dsr.app.entry import run_eval, run_train
 from dsr.cli import main
 from dsr.report.study.key import write_key
 from dsr.report.study.percentages import COLUMNS
@@ -103,19 +101,16 @@ def results(folder: Path) -> None:
         small_results.write_result(folder / "out" / f"{number:06}", pose=captures.pose(number).tolist())
 
 
-def _again(folder: Path, *parts: str) -> list[object]:
-    """Return the arguments that make parts of the stored results."""
-    options = ("--method", "bicubic", "--fill", "all", "--only", ",".join(parts))
+def _again(folder: Path) -> list[object]:
+    """Return the arguments that make the stored results."""
+    options = ("--method", "bicubic", "--fill", "all", "--only", "depth,normals,confidence,input,nerfstudio")
     return ["upsample", folder / "scan", "-o", folder / "out", *options]
-
-
-_PARTS = ("depth", "normals", "confidence", "input", "nerfstudio")
 
 
 def kept_results(folder: Path) -> None:
     """Write the pictures of a sequence with poses, and their results."""
     captures.stray(folder / "scan", video=False)
-    _quietly(*_again(folder, *_PARTS))
+    _quietly(*_again(folder))
 
 
 def study(folder: Path) -> None:
@@ -142,15 +137,6 @@ def _hydra(name: str, *arguments: str) -> None:
         run(lambda: {"eval": run_eval, "train": run_train}[name](arguments))
     except RefusedError as refused:  # a line may begin with the key of a configuration
         raise RefusedError([re.sub(r"^([a-z_]+(\.\w+)*: )", r"input/ \1", line) for line in refused.lines]) from refused
-
-
-def _composed(place: Place) -> None:
-    """Compose an evaluation with a user's method and data set, and read the method."""
-
-    def job(config: DictConfig) -> None:
-        EvalConfig.of(plain_config(config))
-
-    run(lambda: run_command("eval", job, ["--config-dir", str(place.input / "conf"), "method=mine", "dataset=ours"]))
 
 
 def _report(*options: str) -> Reader:
@@ -181,11 +167,8 @@ COMMANDS = (
            lambda place: command("view", place.input / "out", "--no-open", "-o", place.out / "view.html")),
     Reader("fuse", results,
            lambda place: command("fuse", place.input / "out", "-o", place.out / "mesh.ply", "--voxel", "0.05"), 2),
-    Reader("upsample again", kept_results, lambda place: command(*_again(place.input, *_PARTS)), 2),
-    Reader("upsample more", kept_results, lambda place: command(
-        *_again(place.input, "depth", "renderings", "cloud", "open3d")), 1),
+    Reader("upsample again", kept_results, lambda place: command(*_again(place.input)), 2),
     Reader("configuration", configuration, lambda place: command(
         "upsample", place.input, "--config-dir", place.input / "conf", "--method", "more", "--set", "data_weight=30",
         "-o", place.out, "--dry-run"), 2),
-    Reader("configuration of eval", configuration, _composed, 1),
 )  # fmt: skip

@@ -8,7 +8,6 @@ import contextlib
 import os
 import sys
 import tempfile
-import types
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -38,8 +37,6 @@ class Watch:
             return  # the version of the project, which runs store
         if event in _NEVER:
             self.seen.append(f"{event}{arguments!r:.200}")
-        elif event == "exec" and _mentions(arguments[0]):
-            self.seen.append(f"executes code of a file ({arguments[0]!r:.100})")
         elif event in _CHANGES or (event == "open" and _writes(*arguments)):
             self.seen += [
                 f"{event} of {path!r:.200}" for path in _paths(event, arguments) if not self._may(event, path)
@@ -77,13 +74,6 @@ def _writes(_: Any, mode: Any, flags: Any) -> bool:
     return any(letter in mode for letter in "wax+") if isinstance(mode, str) else bool((flags or 0) & _WRITING)
 
 
-def _mentions(code: Any) -> bool:
-    """Return whether code has the mark in one of its names or constants, or in the code inside it."""
-    if isinstance(code, str):
-        return MARK in code
-    return isinstance(code, types.CodeType) and any(map(_mentions, (*code.co_names, *code.co_consts)))
-
-
 class _Finder:
     """Sees imports of a module that only a file names; ``importlib`` raises no event of its own."""
 
@@ -98,17 +88,12 @@ _current: Watch | None = None
 _installed = False
 
 
-def _hook(event: str, arguments: tuple[Any, ...]) -> None:
-    if _current is not None:
-        _current.look(event, arguments)
-
-
 @contextlib.contextmanager
 def watching(*folders: Path) -> Iterator[Watch]:
     """Watch in the block what the process does; it may write below some folders, the cache and temporary folders."""
     global _current, _installed  # noqa: PLW0603 - a hook is one for the process
     if not _installed:
-        sys.addaudithook(_hook)
+        sys.addaudithook(lambda event, arguments: _current.look(event, arguments) if _current is not None else None)
         sys.meta_path.insert(0, _Finder)
         _installed = True
     temporary = [f"{tempfile.gettempdir()}/{beginning}" for beginning in ("tmp", ".dsr-")]

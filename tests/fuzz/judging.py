@@ -1,10 +1,8 @@
 """One case: a reader on its files, and whether it ended as it must."""
 
 import contextlib
-import gc
 import io
 import os
-import re
 import signal
 import sys
 import tempfile
@@ -16,16 +14,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from bombs import limited_memory
+
 from dsr.utils.console import one_line, printable
+from dsr.utils.guards import refusing_excess
 from fuzz.guard import MARK, watching
 
-SECONDS, MEGABYTES = 20.0, 2000.0  # Limits of a case: seconds of computing, and memory
+SECONDS, MEMORY = 20.0, 2 << 30  # Limits of a case: seconds of computing, and bytes, as commands limit their memory
 _WAITING = 60.0  # Seconds that a case may take on a machine that does much else
 _LONGEST_LINE = 1000
 _SHORTEST_NAME = 3  # Names of fewer letters are found in any message
 REFUSALS = (ValueError, OSError)  # What the commands turn into a line
-_SILENT = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
-"""Warnings that Python does not show to users."""
+_SILENT = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)  # Python shows users none
 
 
 class RefusedError(Exception):
@@ -44,26 +44,13 @@ class _TooLongError(BaseException):
     """A case that did not end in time; no ``except Exception`` catches it."""
 
 
-@dataclass(frozen=True)
 class Place:
     """The folder of a case, with the files that are read in ``input``; commands write to ``out``."""
 
-    root: Path
-
-    @property
-    def input(self) -> Path:
-        """The folder of the files that are read."""
-        return self.root / "input"
-
-    @property
-    def out(self) -> Path:
-        """The folder that a command may write to."""
-        return self.root / "out"
-
-    @property
-    def canary(self) -> Path:
+    def __init__(self, root: Path) -> None:
+        self.root, self.input, self.out = root, root / "input", root / "out"
+        self.canary = Path(MARK)
         """A folder that only code from a file makes; relative, so that the files are the same wherever a case runs."""
-        return Path(MARK)
 
 
 @dataclass(frozen=True)
@@ -73,16 +60,12 @@ class Outcome:
     kind: Literal["value", "refusal", "unclean"]
     text: str
     seconds: float
-    megabytes: float
 
 
 def judge(read: Callable[[Place], Any], place: Place) -> Outcome:
     """Run a reader on the files of a place."""
-    names = _names(place)
-    before = _begin_memory()
-    started = time.process_time()
-    problems: list[str] = []
-    lines: list[str] = []
+    names, started = _names(place), time.process_time()
+    problems, lines = list[str](), list[str]()
     with (
         _captured() as printed,
         watching(place.input, place.out) as watch,
@@ -90,59 +73,41 @@ def judge(read: Callable[[Place], Any], place: Place) -> Outcome:
     ):
         warnings.simplefilter("default")
         try:
-            with _limited():
+            with _limited(), limited_memory(MEMORY), refusing_excess():
                 read(place)
         except RefusedError as refusal:
             lines = refusal.lines
             problems += [] if lines else ["ends with exit code 2 without a line"]
         except REFUSALS as error:
             lines = [one_line(error)]
-            if _lacked_memory(error):
-                problems.append(f"refused only after asking for the memory that the file claims: {error!s:.200}")
         except _TooLongError as error:
             problems.append(f"takes longer than {SECONDS:g} s, or waits: {_where(error)}")
         except BaseException as error:
             cause = error.__cause__ or error if isinstance(error, EscapedError) else error
             problems.append(f"{type(cause).__name__}: {cause!s:.300} {_where(cause)}")
-    seconds, megabytes = time.process_time() - started, max(0.0, _status("VmHWM") - before)
     left = sorted(path.name for path in place.root.iterdir() if path.name not in ("input", "out"))
     left += [MARK] if place.canary.exists() else []
     problems += [f"does what a reader must not: {each}" for each in watch.seen[:3]]
     problems += [f"leaves {name!r} beside its folders" for name in left]
     problems += [f"warns: {each.message!s:.200}" for each in reported if not issubclass(each.category, _SILENT)][:2]
     problems += [f"prints {each:.200}" for each in printed]
-    problems += [f"takes {megabytes:.0f} MB"] if megabytes > MEGABYTES else []
     for line in lines:
-        problems += _wrong_with(line, names)
-    if problems:
-        return Outcome("unclean", "; ".join(problems), seconds, megabytes)
-    return Outcome("refusal" if lines else "value", " | ".join(lines), seconds, megabytes)
-
-
-def _wrong_with(line: str, names: Sequence[str]) -> list[str]:
-    """Return what is wrong with the line of a refusal."""
-    problems = [f"a line of {len(line)} characters: {line[:200]}"] if len(line) > _LONGEST_LINE else []
-    if not any(name in line for name in names):
-        problems.append(f"names no file: {line[:300]}")
-    if line != printable(line) or "\n" in line:
-        problems.append(f"has characters that do not print: {line[:300]!r}")
-    return problems
+        if len(line) > _LONGEST_LINE:
+            problems.append(f"a line of {len(line)} characters: {line[:200]}")
+        if "not enough memory" not in line and not any(name in line for name in names):
+            problems.append(f"names no file: {line[:300]}")
+        if line != printable(line) or "\n" in line:
+            problems.append(f"has characters that do not print: {line[:300]!r}")
+    kind: Literal["value", "refusal", "unclean"] = "unclean" if problems else "refusal" if lines else "value"
+    return Outcome(kind, "; ".join(problems) or " | ".join(lines), time.process_time() - started)
 
 
 def _names(place: Place) -> list[str]:
     """Return the names of the files and folders of a case, one of which a refusal must have."""
     found = {place.input.name + "/", str(place.input), str(place.out)}
     for folder, folders, files in os.walk(place.input):
-        found.update((*folders, *files, *(Path(name).stem for name in files)))
-        found.add(folder)
-    return sorted(name for name in found if len(name) >= _SHORTEST_NAME)
-
-
-def _lacked_memory(error: BaseException | None) -> bool:
-    """Return whether an error is only that there was no memory for what a file claims."""
-    while error is not None and not isinstance(error, MemoryError):
-        error = error.__cause__ or error.__context__
-    return error is not None
+        found.update((folder, *folders, *files, *(Path(name).stem for name in files)))
+    return [name for name in found if len(name) >= _SHORTEST_NAME]
 
 
 def _where(error: BaseException) -> str:
@@ -192,19 +157,3 @@ def _captured() -> Iterator[list[str]]:
             file.seek(0)
             text = file.read(4000).decode(errors="replace").strip()
             found += [text] if text else []
-
-
-def _begin_memory() -> float:
-    """Forget the highest memory so far, and return the present one in MB."""
-    gc.collect(0)
-    with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as file:  # noqa: PTH123 - Linux's
-        file.write("5")
-    return _status("VmRSS")
-
-
-def _status(key: str) -> float:
-    """Return a figure of Linux in MB; 0 elsewhere."""
-    with contextlib.suppress(OSError), open("/proc/self/status") as file:  # noqa: PTH123 - Linux's
-        found = re.search(rf"{key}:\s+(\d+) kB", file.read())
-        return int(found[1]) / 1e3 if found else 0.0
-    return 0.0

@@ -5,7 +5,6 @@ import functools
 import importlib.util
 import io
 import json
-import os
 import tarfile
 import tempfile
 import zipfile
@@ -27,8 +26,7 @@ from small_files import written
 from small_lpips import random_trunk
 
 from dsr.cli import main
-from dsr.data.download.collections import Collection, Item
-from dsr.data.download.fetching import state, unpack, verify
+from dsr.data.download.fetching import unpack
 from dsr.data.folder import Folder
 from dsr.data.ibims import IBims
 from dsr.data.nyu import NYU
@@ -43,7 +41,6 @@ from dsr.methods.networks.peers.local_filters import SVLRM
 from dsr.methods.networks.peers.peer_network import load_peer
 from dsr.methods.networks.trained import load_msg_weights
 from dsr.metrics.lpips import load_lpips
-from dsr.utils.progress import Progress
 from fuzz.judging import REFUSALS, EscapedError, Place, RefusedError
 
 
@@ -202,19 +199,6 @@ def data_set(make: Callable[..., Any], **settings: Any) -> Callable[[Place], Non
     return read
 
 
-def read_prepared(folder: Path) -> None:
-    """Read a scene of a data set: prepared, and from the damaged or kept cache."""
-    with mock.patch.dict(os.environ, DSR_CACHE=str(folder / "cache")):
-        source = data_set_files.opened(data_set_files.SETS["icl"], folder, size=64)
-        source.load(source.scenes()[0])
-
-
-def prepared(folder: Path) -> None:
-    """Write a frame and the cache of its prepared scene."""
-    data_set_files.write_frame("icl", folder)
-    read_prepared(folder)
-
-
 def scenes(folder: Path) -> None:
     """Write two scenes of dsr's own layout: depth with a mask and a measured map, and disparity."""
     rows = np.mgrid[0:48, 0:64][0]
@@ -249,7 +233,6 @@ OF_SETS = (
            data_set(IBims, scenes="found"), 1),
     Reader("data tofmark", tofmark, data_set(
         ToFMark, scenes="found", depth_range=[1.0, 4.0], intrinsics=[40.0, 40.0, 19.5, 9.5]), 6),
-    Reader("data prepared", prepared, lambda place: read_prepared(place.input), 1),
     Reader("doctor", scenes, lambda place: command("doctor", place.input), 1),
 )  # fmt: skip
 
@@ -274,23 +257,6 @@ def read_archive(path: Path) -> None:
     unpack(path, path.parents[1] / "out" / "set", lambda *_, **__: None)
 
 
-def checksums(path: Path) -> None:
-    """Write a record of downloaded files, and one of them."""
-    written(path.parent / "books" / "b.txt", b"content")
-    digest = "ed7002b439e9ac845f22357d822bac1444730fbdb6016d3ec9432297b9ec9f73"
-    entries = {"books/b.txt": {"sha256": digest, "size": 7}, "a.zip": {"sha256": None, "size": 9, "files": {"x": 1}}}
-    path.write_text(json.dumps(entries))
-
-
-def read_checksums(path: Path) -> None:
-    items = (Item("books/b.txt", ("https://localhost/b.txt",)),)
-    collection = Collection("books", "Books", "", "", "", ("books",), None, items)
-    state(collection, path.parent)
-    problems = verify(collection, path.parent, Progress())
-    if problems:
-        raise RefusedError(problems)
-
-
 def caffe_model(path: Path) -> None:
     tests = unit("test_trained_weights")
     path.write_bytes(tests.caffemodel(tests.caffe_layers(MSGNet(2, "hui"))))
@@ -313,7 +279,6 @@ FILES = {
     "hui.caffemodel": (caffe_model, lambda path: load_msg_weights(path, 2)),
     **{name: (peer, lambda path: load_peer(path, SVLRM, 4)) for name in ("peer.pth", "peer_old.pth")},
     "lpips.pth": (lambda path: torch.save(random_trunk(), path), load_lpips),
-    "checksums.json": (checksums, read_checksums),
     **dict.fromkeys(("set.zip", "set.tar", "set.tar.gz"), (archive, read_archive)),
 }  # fmt: skip
 

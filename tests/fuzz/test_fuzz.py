@@ -3,24 +3,23 @@
 import dataclasses
 import os
 import pickle
-import shutil
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 from random import Random
 
 import numpy as np
 import pytest
+import torch
 
 from dsr.io.captures.contract import Capture
 from dsr.io.captures.registry import CAPTURES
 from fuzz import judging, readers
-from fuzz.cases import READERS, Cases, numbers_of
+from fuzz.cases import READERS, Cases
 from fuzz.guard import MARK
 from fuzz.judging import Place, RefusedError, judge
 from fuzz.texts import pickled
-
-SEED = 2
 
 
 @pytest.fixture
@@ -62,16 +61,13 @@ BAD = {
     "leaves": (lambda place: place.canary.mkdir(), f"leaves '{MARK}' beside its folders"),
     "starts": (lambda _: subprocess.run([sys.executable, "--version"], check=True), "subprocess.Popen"),
     "imports": (lambda _: __import__("importlib").import_module(MARK), f"imports {MARK}"),
-    "runs": (lambda _: exec(f"{MARK} = 1"), "executes code of a file"),
     "reads": (lambda place: (place.input / "../../x").read_bytes(), "reads '"),
     "removes": (lambda place: (place.root.parent / "y").unlink(missing_ok=True), "os.remove of"),
     "prints": (lambda _: os.write(2, b"libpng error"), "prints libpng error"),
     "warns": (lambda _: warnings.warn("overflow", RuntimeWarning, stacklevel=1), "warns: overflow"),
     "computes": (compute, "takes longer than"),
     "waits": (wait, "takes longer than"),
-    "takes memory": (lambda _: np.ones(20 << 20).sum(), "takes 1"),
     "fails": (lambda _: {}["key"], "KeyError: 'key'"),
-    "claims": (lambda _: np.ones(1 << 45), "MemoryError"),
     "names no file": (refuse(ValueError("expected a number")), "names no file: expected a number"),
     "says nothing": (refuse(RefusedError([])), "without a line"),
     "obeys": (refuse(RefusedError(["scan.json: \x1b[2J"])), "do not print"),
@@ -83,11 +79,15 @@ BAD = {
 def test_case_in_which_a_reader_does_what_it_must_not_is_unclean(place, monkeypatch, what):
     monkeypatch.setattr(judging, "SECONDS", 0.2)
     monkeypatch.setattr(judging, "_WAITING", 0.5)
-    monkeypatch.setattr(judging, "MEGABYTES", 100)
     read, text = BAD[what]
     outcome = judge(read, place)
     assert outcome.kind == "unclean"
     assert text in outcome.text
+
+
+def test_case_that_takes_more_than_the_limit_of_memory_ends_in_a_line(place, monkeypatch):
+    monkeypatch.setattr(judging, "MEMORY", 100 << 20)
+    assert judge(lambda _: np.ones(20 << 20).sum(), place).kind == "refusal"
 
 
 def test_every_capture_of_the_registry_that_recognises_its_files_is_asked(tmp_path):
@@ -104,17 +104,20 @@ def test_every_capture_of_the_registry_that_recognises_its_files_is_asked(tmp_pa
 
 
 @pytest.fixture(scope="module")
-def cases():
+def cases(request, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DSR_CACHE", "")  # what it was comes back
-        made = Cases(SEED)
-        patch.chdir(made.folder)
-        yield made
-        shutil.rmtree(made.folder)
+        patch.chdir(tmp_path_factory.mktemp("fuzz"))
+        torch.set_num_threads(1)
+        yield Cases(request.config.getoption("--seed", 2), Path.cwd())
 
 
 @pytest.mark.parametrize("reader", READERS, ids=[reader.name.replace(" ", "_") for reader in READERS])
-def test_reader_ends_with_a_value_or_lines_that_name_the_file(cases, reader):
-    done = [cases.run(number) for number in numbers_of(reader)]
+def test_reader_ends_with_a_value_or_lines_that_name_the_file(cases, reader, request):
+    rounds, case, keep = (request.config.getoption(name, None) for name in ("--rounds", "--case", "--keep"))
+    numbers = range(reader.weight * (rounds or 1)) if case is None else [case]
+    folders = [None if keep is None else request.config.invocation_params.dir / keep / reader.name / f"{number}"
+               for number in numbers]  # fmt: skip
+    unclean = [cases.run(reader, number, folder) for number, folder in zip(numbers, folders, strict=True)]
     assert cases.of_valid_files[reader.name].kind == "value", cases.of_valid_files[reader.name].text
-    assert [str(case) for case in done if case.outcome.kind == "unclean"] == []
+    assert list(filter(None, unclean)) == []

@@ -13,35 +13,26 @@ from dsr.app.entry import run_command
 from dsr.cli import main
 from fuzz.texts import NUMBERS
 
-checked = settings(
-    derandomize=True, database=None, deadline=None, max_examples=100, suppress_health_check=list(HealthCheck)
-)
-few = settings(checked, max_examples=10)
+checked = settings(derandomize=True, database=None, deadline=None, suppress_health_check=list(HealthCheck))
 LINES = st.text(st.characters(codec="utf-8"), max_size=40)
 NUMBER_TEXTS = st.one_of(st.sampled_from(NUMBERS), st.floats().map(str), st.integers().map(str), LINES)
 
 
-OPTIONS = {
-    "--fov": NUMBER_TEXTS, "--depth-unit": NUMBER_TEXTS, "--range-type": LINES, "--baseline": NUMBER_TEXTS,
-    "--hole-value": NUMBER_TEXTS, "--min-confidence": NUMBER_TEXTS, "--method": LINES, "--noise": NUMBER_TEXTS,
-    "--smooth": NUMBER_TEXTS, "--set": LINES | NUMBER_TEXTS.map("data_weight={}".format), "--config-dir": LINES,
-    "--scale": NUMBER_TEXTS, "--neighbours": NUMBER_TEXTS, "--workers": st.sampled_from(["0", "-1", "x", "9" * 400]),
-    "--device": LINES, "--fill": LINES, "--max-hole": NUMBER_TEXTS, "--format": LINES, "--only": LINES,
-    "--without": LINES, "--with": LINES, "--max-error": NUMBER_TEXTS, "--max-faces": NUMBER_TEXTS,
-    "--max-points": NUMBER_TEXTS, "--camera": LINES, "--poses": LINES, "--extrinsics": LINES, "--mask": LINES,
-}  # fmt: skip
-"""Options of ``dsr upsample`` with what people may type after them."""
-COMMAND_LINES = st.lists(
-    st.sampled_from(list(OPTIONS)).flatmap(lambda name: OPTIONS[name].map(lambda value: (name, value))), max_size=3
-)
+# Options of ``dsr upsample`` that take a value.
+OPTIONS = (
+    "baseline", "camera", "config-dir", "depth-unit", "device", "extrinsics", "fill", "format", "fov", "hole-value",
+    "mask", "max-error", "max-faces", "max-hole", "max-points", "method", "min-confidence", "neighbours", "noise",
+    "only", "poses", "range-type", "scale", "set", "smooth", "with", "without", "workers",
+)  # fmt: skip
+VALUES = NUMBER_TEXTS | NUMBER_TEXTS.map("data_weight={}".format)
 
 
 @settings(checked, max_examples=60)
-@given(COMMAND_LINES)
+@given(st.lists(st.tuples(st.sampled_from(OPTIONS), VALUES), max_size=3))
 def test_options_of_upsample_are_accepted_or_refused_in_lines(tmp_path_factory, chosen):
     folder = tmp_path_factory.getbasetemp() / "nothing"
     errors = io.StringIO()
-    arguments = [f"{name}={value}" for name, value in chosen]
+    arguments = [f"--{name}={value}" for name, value in chosen]
     with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()):
         try:
             code = main(
@@ -65,7 +56,7 @@ OVERRIDES = st.tuples(
 ).map("".join)  # fmt: skip
 
 
-@few
+@settings(checked, max_examples=10)
 @given(st.lists(OVERRIDES, min_size=1, max_size=2))
 @example(["=3"])
 @example(["+validation.x=5"])

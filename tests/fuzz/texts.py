@@ -49,9 +49,6 @@ _YAML = (
     "${oc.env:HOME}", "${oc.decode:'[1,2]'}", "${x.y}", "${", "{? }", "1:20", "2001-01-01", "0o17", "~", "<<: 1",
     "!!set {a, b}", "!!omap [a: 1]", "|\n  text", "???",
 )  # fmt: skip
-_BOMB = "a: &a [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
-    f"{b}: &{b} [{','.join(['*' + a] * 10)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
-)
 _HOLE = "dsr-hole"
 
 
@@ -62,7 +59,7 @@ class _Payload:
         self._what, self._canary = what, str(canary)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        code = f"import os\nos.makedirs({self._canary!r}, exist_ok=True)\n{MARK} = 1"
+        code = f"import os\nos.makedirs({self._canary!r}, exist_ok=True)"
         return (
             (os.mkdir, (self._canary,)),
             (os.system, (f"mkdir -p '{self._canary}'",)),
@@ -88,35 +85,28 @@ def mutate_structured(random: Random, text: str, *, of_yaml: bool) -> bytes:
     try:
         content = yaml.safe_load(text) if of_yaml else json.loads(text)
     except (yaml.YAMLError, ValueError, RecursionError):
-        return mutate_text(random, text)
+        content = None
+    places = _places(content)
     pick = random.random()
-    if pick < 0.2:
+    if pick < 0.2 or not places:
         return mutate_text(random, text)
-    if of_yaml and pick < 0.25:
-        return (text + "\n" + _BOMB).encode()
+    (container, key), (other, name) = random.choice(places), random.choice(places)
+    value: Any = random.choice((*_PLAIN, *_TARGETS, MARK))
+    if pick < 0.25:
+        value = {"_target_": random.choice(_TARGETS), "name": "x", "command": f"mkdir {MARK}", "path": MARK}
+    raw = random.choice((*_YAML, *_RAW) if of_yaml else _RAW)
     if pick < 0.45:
-        changed = _dumped(_replaced(random, content, _HOLE), of_yaml=of_yaml)
-        value = random.choice((*_YAML, *_RAW) if of_yaml else _RAW)
-        changed = changed.replace(_HOLE if of_yaml else json.dumps(_HOLE), value, 1)
-    else:
-        for _ in range(random.choice((1, 1, 1, 2))):
-            content = _changed(random, content)
-        changed = _dumped(content, of_yaml=of_yaml)
-    return changed.encode(errors="surrogatepass")
-
-
-def _dumped(content: Any, *, of_yaml: bool) -> str:
-    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True) if of_yaml else json.dumps(content)
-
-
-def _plain(random: Random) -> Any:
-    """Return a value that JSON and YAML can hold."""
-    pick = random.random()
-    if pick < 0.1:
-        return random.choice((*_TARGETS, MARK))
-    if pick < 0.15:
-        return {"_target_": random.choice(_TARGETS), "name": "x", "command": f"mkdir {MARK}", "path": MARK}
-    return random.choice(_PLAIN)
+        value = _HOLE
+    if pick < 0.75:
+        container[key] = value
+    elif pick < 0.82:
+        del container[key]
+    elif pick < 0.92 and isinstance(container, dict):
+        container[random.choice((*_KEYS, f"{key} "))] = random.choice((value, container.pop(key)))
+    elif not isinstance(other[name], dict | list):
+        container[key] = other[name]
+    changed = yaml.safe_dump(content, sort_keys=False, allow_unicode=True) if of_yaml else json.dumps(content)
+    return changed.replace(_HOLE if of_yaml else json.dumps(_HOLE), raw, 1).encode(errors="surrogatepass")
 
 
 def _places(content: Any) -> list[tuple[Any, Any]]:
@@ -134,35 +124,6 @@ def _places(content: Any) -> list[tuple[Any, Any]]:
         found += [(each, key) for key in keys]
         containers += [(each[key], depth + 1) for key in keys]
     return found
-
-
-def _replaced(random: Random, content: Any, value: Any) -> Any:
-    """Return a content with one of its values replaced."""
-    places = _places(content)
-    if not places or random.random() < 0.03:
-        return value
-    container, key = random.choice(places)
-    container[key] = value
-    return content
-
-
-def _changed(random: Random, content: Any) -> Any:
-    """Return a content with a value replaced, removed or copied, or a key renamed or added."""
-    places = _places(content)
-    pick = random.random()
-    if pick < 0.6 or not places:
-        return _replaced(random, content, _plain(random))
-    container, key = random.choice(places)
-    other, name = random.choice(places)
-    if pick < 0.72:
-        del container[key]
-    elif pick < 0.8 and isinstance(container, dict):
-        container[random.choice((*_KEYS, f"{key} "))] = container.pop(key)
-    elif pick < 0.9 and isinstance(container, dict):
-        container[random.choice(_KEYS)] = _plain(random)
-    elif not isinstance(other[name], dict | list):
-        container[key] = other[name]
-    return content
 
 
 def _replace(pattern: str, values: Sequence[str]) -> Callable[[Random, str], bytes]:

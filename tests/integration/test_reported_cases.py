@@ -36,8 +36,7 @@ from dsr.geometry.planes import inverse_votes
 from dsr.inference import plan_for, upsampler
 from dsr.inference.working_size import left_of, limit_to_noise
 from dsr.io.cameras import read_any_camera
-from dsr.io.depth_files import read_depth_file
-from dsr.io.encoding import far_marks
+from dsr.io.depth_files import far_marks, read_depth_file
 from dsr.io.images import read_mask, read_rgb
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder

@@ -343,7 +343,7 @@ def change_camera(**changes):
 MIRROR = {f"t_{row}{row}": 1.0 - 2 * (row == 0) for row in range(3)} | {
     f"t_{row}{column}": 0.0 for row in range(3) for column in range(3) if row != column
 }
-NO_POSE = "expected a rigid pose"
+NO_POSE = "expected a rigid transform"
 PINCAM = "lowres_wide_intrinsics/41069021_10.001.pincam"
 BROKEN = {
     "intrinsics of a frame": (captures.stray, change_text("odometry.csv", ", 51.000000000", ", nan"),

@@ -17,12 +17,12 @@ from dsr.io.exports import (
     Written,
     read_input,
     write_cloud,
+    write_glb,
     write_input,
     write_mesh,
     write_normals,
     write_renderings,
 )
-from dsr.io.glb import write_glb
 
 CAMERA = Camera(24, 18, 30, 30, 11.5, 8.5)
 NORMAL_OF_A_WALL = [128, 128, 255]

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from dsr.geometry.camera import Camera
-from dsr.io.encoding import encode
+from dsr.io.depth_files import encode
 from dsr.io.inputs import FolderUnits, read_picture
 from dsr.io.pairs import Pair
 from dsr.io.reading import CameraChoice, Reading, RigFiles

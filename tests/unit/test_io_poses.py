@@ -60,8 +60,10 @@ def test_extrinsics_are_read_in_every_format(tmp_path, name, content):
         ("x.json", '{"a": 1}', "got something else"),
         ("x.json", '[["a", 1]]', "got something else"),
         ("x.txt", text(np.block([[np.eye(3), np.array([[15.0], [0], [0]])]])), "are these millimetres"),
+        ("x.txt", "1 0 0 -1e308\n0 1 0 0\n0 0 1 0\n", "expected a translation"),
     ],
 )
+@pytest.mark.filterwarnings("error")
 def test_bad_extrinsics_are_refused_in_one_line(tmp_path, name, content, message):
     (tmp_path / name).write_text(content)
     with pytest.raises(ValueError, match=message) as caught:

@@ -1,6 +1,9 @@
-"""The three formats of a table: what stands in them, that it stands there unharmed, and that LaTeX takes it."""
+"""The three formats of a table: what stands in them, that LaTeX takes it, and that no name in it is run as code."""
 
+import dataclasses
 import io
+import json
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -9,14 +12,10 @@ import pandas as pd
 import pytest
 
 from dsr.evaluation.results import Results, Run
-from dsr.report.table_layouts import (
-    MISSING,
-    latex_text,
-    to_csv,
-    to_document,
-    to_latex,
-    to_markdown,
-)
+from dsr.evaluation.run_files import load_results, read_run
+from dsr.report.correlation_figure import save_scatter_matrix
+from dsr.report.study.study_table import PERCENTAGES, read_study
+from dsr.report.table_layouts import MISSING, escaped, latex_text, to_csv, to_document, to_latex, to_markdown
 from dsr.report.tables import build_tables
 
 ODD = "a|b_*x* 50% & $1 {c} \\d #e ~f ^g <u> `h` \"i\" 'j'"
@@ -168,3 +167,76 @@ def test_latex_compiles_and_nothing_runs_off_the_page(tmp_path):
     assert "Overfull" not in done.stdout
     assert "Float too large" not in done.stdout
     assert "Missing character" not in (tmp_path / "all.log").read_text(encoding="latin-1")
+
+
+# Names that are commands or code
+
+
+NAMES = (
+    "=cmd|' /C calc'!A0", "+1", "-0.5", "@SUM(A1)", "\tx", "\rx", "x\r=y", "\nx", "'=x", "''-x", "'", "'x", "plain",
+    "", "é=", "<script>alert(1)</script>", "\\input{/etc/passwd}", "`id`", "a|b", "$\\frac$", "[2pt]",
+)  # fmt: skip
+HOSTILE = "=cmd|' \\input{/etc/passwd} `id` <script>alert(1)</script> $\\frac$"
+
+
+@pytest.fixture
+def hostile(make_run, tmp_path):
+    """A run whose method, data set, scene and a metric have a hostile name."""
+    folder = make_run(tmp_path / "run", label=HOSTILE, method=HOSTILE, dataset=HOSTILE)
+    scene = HOSTILE.replace("/", "")
+    for kind in ("scenes", "predictions"):
+        (folder / kind / "cube_no_texture.npz").rename(folder / kind / f"{scene}.npz")
+    scores = pd.read_csv(folder / "scores.csv", keep_default_na=False)
+    scores["scene"] = scene
+    scores.loc[scores["metric"] == "Bumpiness_d", "metric"] = HOSTILE
+    scores.to_csv(folder / "scores.csv", index=False)
+    summary = json.loads((folder / "summary.json").read_text())
+    summary["seconds"] = {scene: 0.25}
+    summary["metrics"] = {HOSTILE: {"heading": HOSTILE, "unit": HOSTILE, "digits": 1}}
+    (folder / "summary.json").write_text(json.dumps(summary))
+    assert set(read_run(folder).scores["method"]) == {HOSTILE}
+    return load_results([folder])
+
+
+def test_tables_of_a_report_have_no_command_or_tag(hostile):
+    for table in build_tables(hostile, None):
+        assert HOSTILE in pd.read_csv(io.StringIO(to_csv(table)), dtype=str)["method"].tolist()
+        markdown = to_markdown(table)
+        assert "\\<script\\>" in markdown
+        assert not re.search(r"(?<!\\)[<`|](?=script|id|/script|\s*\\\\input)", markdown)
+        latex = to_latex(table)
+        assert "\\textbackslash{}input\\{/etc/passwd\\}" in latex
+        assert not re.search(r"\\input\b|\\frac\b|(?<!\\)\$\\textb", latex)
+        assert "/" not in table.name
+        for part in markdown.split("\n\n"):  # rows have as many cells as the head
+            lines = [line for line in part.splitlines() if line.startswith("|")]
+            assert len({len(re.findall(r"(?<!\\)\|", line)) for line in lines}) <= 1
+
+
+def test_latex_rows_do_not_begin_with_an_option(hostile):
+    [run] = hostile.runs
+    scene = run.scenes[0]
+    named = {"scenes": ("[2pt]",), "scores": run.scores.assign(scene="[2pt]"), "seconds": {"[2pt]": run.seconds[scene]}}
+    odd = dataclasses.replace(run, **named)
+    tables = build_tables(dataclasses.replace(hostile, runs=(odd,)), None)
+    assert any("\n{}[2pt] & " in to_latex(table) for table in tables)
+    assert not any(re.search(r"(\\\\|rule)\s*[\[*]", to_latex(table)) for table in tables)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_name_is_a_command_of_latex_or_markdown(name):
+    assert not re.search(r"\\(?!textbackslash|textasci|textless|textgreater|textbar|[{}$&#%_])[a-z]", latex_text(name))
+    assert not re.search(r"(?<!\\)[`<>|]", escaped(name))
+
+
+def test_figures_show_names_that_look_like_formulas_of_tex(hostile, tmp_path):
+    more = dataclasses.replace(hostile.runs[0], label="$\\frac$ $x", folder=hostile.runs[0].folder)
+    both = dataclasses.replace(hostile, runs=(hostile.runs[0], more))
+    assert all(path.stat().st_size > 1000 for path in save_scatter_matrix(both, tmp_path / "figures"))
+
+
+def test_study_is_read_with_its_names(tmp_path):
+    shares = dict.fromkeys(PERCENTAGES, 50.0)
+    about = {"dataset": "-1", "scene": "@x", "scale": 4, "downsampling": "box", "label": HOSTILE}
+    (tmp_path / "study.csv").write_text(pd.DataFrame([{**about, **shares}]).to_csv(index=False))
+    assert read_study(tmp_path / "study.csv").iloc[0][[*about]].to_dict() == about

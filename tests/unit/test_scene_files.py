@@ -13,8 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from dsr.geometry.camera import Camera
 from dsr.io.depth_files import write_depth_file
-from dsr.io.open3d import write_open3d, write_rgbd
-from dsr.io.scene_files import Frame, parse_pose, to_millimetres, write_rerun, write_splatting, write_transforms
+from dsr.io.scene_files import (
+    Frame,
+    parse_pose,
+    to_millimetres,
+    write_open3d,
+    write_rerun,
+    write_rgbd,
+    write_splatting,
+    write_transforms,
+)
 
 CAMERA = Camera(12, 8, 10.0, 11.0, 5.25, 3.5)
 POSE = torch.tensor(
@@ -120,14 +128,6 @@ def test_transforms_are_read_as_nerfstudio_reads_them(make, tmp_path, second):
     first = json.loads(path.read_text())
     np.testing.assert_allclose(np.array(first["frames"][0]["transform_matrix"]) @ np.diag([1, -1, -1, 1]), POSE)
     assert ("fl_x" in first) == (second == CAMERA)
-
-
-def test_transforms_of_different_cameras_have_intrinsics_for_each_frame(make, tmp_path):
-    frames = [make(0), make(1, camera=Camera(12, 8, 20.0, 21.0, 5.25, 3.5))]
-    write_transforms(tmp_path / "t.json", frames)
-    entries = json.loads((tmp_path / "t.json").read_text())
-    assert "fl_x" not in entries
-    assert [each["fl_x"] for each in entries["frames"]] == [10, 20]
 
 
 @pytest.mark.parametrize(("part", "write"), [("nerfstudio", write_transforms), ("gaussian", write_splatting)])

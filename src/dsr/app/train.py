@@ -52,6 +52,7 @@ from dsr.training.callbacks import log_layout
 from dsr.training.data_module import PatchData
 from dsr.training.module import SuperResolution
 from dsr.utils import interruption
+from dsr.utils.arrays import read_torch_file
 from dsr.utils.checkpoints import BestCheckpoint, DivergenceError, Interruption
 from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError, build, expect_library
@@ -61,7 +62,6 @@ from dsr.utils.guards import did_you_mean
 from dsr.utils.lightning import ScoreTables, StepProgress, fit, make_trainer, without_chatter
 from dsr.utils.progress import Progress
 from dsr.utils.runs_table import list_run
-from dsr.utils.torch_files import read_torch_file
 
 MONITOR = "val/RMSE_v"
 _LARGEST_SEED = 2**32 - 1

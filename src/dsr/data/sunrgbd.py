@@ -36,7 +36,7 @@ from dsr.data.frame_files import (
 from dsr.data.preparation import Frames, FrameSet, Preparation, rename_frames
 from dsr.data.scene_source import SceneSelection
 from dsr.geometry.camera import Camera
-from dsr.io.encoding import turn_back_bits
+from dsr.io.depth_files import turn_back_bits
 from dsr.io.images import read_numbers
 from dsr.io.reading import SUNRGBD_BITS
 from dsr.sample import Scene

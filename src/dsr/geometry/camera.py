@@ -117,8 +117,8 @@ class Camera:
     @classmethod
     def from_json(cls, path: str | Path) -> Self:
         """Return the camera of dsr's ``camera.json``, Open3D's JSON, or ``cam_params.json`` as NICE-SLAM has it."""
-        read = importlib.import_module("dsr.io.cameras").read_sized_camera  # files are read on a floor above
-        return cls(**vars(read(Path(path))))
+        read = importlib.import_module("dsr.io.cameras").read_camera  # files are read on a floor above
+        return cls(**vars(read(Path(path)).camera))
 
     def crop(self, top: int, left: int, height: int, width: int) -> Camera:
         """Return the camera of the ``height x width`` window whose first pixel is (``top``, ``left``)."""

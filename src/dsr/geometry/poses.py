@@ -68,11 +68,6 @@ def orthonormal_error(turn: np.ndarray) -> float:
         return float(np.abs(turn @ turn.T - np.eye(3)).max())
 
 
-def is_rotation(turn: np.ndarray) -> bool:
-    """Return whether a matrix, (3, 3), is a rotation, of the decimals that files have."""
-    return orthonormal_error(turn) <= _TOLERANCE and float(np.linalg.det(turn)) > 0
-
-
 def from_quaternion(translation: Sequence[float], quaternion: Sequence[float], name: str) -> Matrix:
     """Return the transform of a translation in metres and a unit quaternion (x, y, z, w)."""
     length = math.hypot(*quaternion)

@@ -38,20 +38,12 @@ _METRES = {"m": 1.0, "mm": 1e-3}
 
 @dataclass(frozen=True)
 class CameraFile:
-    """The content of a camera file.
+    """The content of a camera file; None for what it does not state."""
 
-    Args:
-        camera: in pixels and metres.
-        range_type: how the maps beside it count; None if it is not stated.
-        depth_unit: metres per value in depth files; None if it is not stated.
-        hole_value: the value that stands for a hole in files that cannot hold NaN; None for none.
-
-    """
-
-    camera: Camera
-    range_type: RangeType | None = None
-    depth_unit: float | None = None
-    hole_value: float | None = None
+    camera: Camera  # in pixels and metres
+    range_type: RangeType | None = None  # how the maps beside it count
+    depth_unit: float | None = None  # metres per value in depth files
+    hole_value: float | None = None  # the value that stands for a hole in files that cannot hold NaN
 
 
 def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) -> tuple[CameraFile, list[Assumption]]:
@@ -82,10 +74,9 @@ def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) ->
 def read_any_camera(path: Path) -> CameraFile | np.ndarray:
     """Return the content of a camera file; for a matrix without an image size the matrix, (3, 3).
 
-    The formats are those of :func:`read_camera`; Open3D's JSON (``width``, ``height`` and ``intrinsic_matrix``, nine
-    numbers column by column); MoGe's JSON (``fov_x`` and ``fov_y`` in degrees), a matrix for pictures of 1 x 1; YAML of
-    OpenCV, ROS and RTAB-Map; and text of 3 x 3 or 4 x 4 numbers, as SUN RGB-D and ScanNet have it, or of fx fy cx cy,
-    as ETH3D has it.
+    The formats are ``camera.json`` of dsr, ``cam_params.json`` as NICE-SLAM's data sets have it, Open3D's JSON, YAML of
+    OpenCV, ROS and RTAB-Map; and, without an image size, MoGe's JSON (``fov_x`` and ``fov_y`` in degrees), and text of
+    3 x 3 or 4 x 4 numbers, as SUN RGB-D and ScanNet have it, or of fx fy cx cy, as ETH3D has it.
     """
     text = read_text(path)
     if "camera_matrix:" in text:
@@ -102,20 +93,19 @@ def read_any_camera(path: Path) -> CameraFile | np.ndarray:
             matrix = expect_intrinsics(np.array(stored.intrinsic_matrix).reshape(3, 3).T)
             numbers = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
             return CameraFile(Camera(stored.width, stored.height, *numbers))
-    return read_camera(path)
-
-
-def read_sized_camera(path: Path) -> Camera:
-    """Return the camera of a file that states the size of its image; see :func:`read_any_camera`."""
-    content = read_any_camera(path)
-    if isinstance(content, np.ndarray):
-        raise ValueError(f"{path}: expected a camera with the size of its image, got a matrix: see Camera.from_matrix")
-    return content.camera
+    return _of_json(path, text)
 
 
 def read_camera(path: Path) -> CameraFile:
+    """Return the content of a camera file that states the size of its image; see :func:`read_any_camera`."""
+    content = read_any_camera(path)
+    if isinstance(content, np.ndarray):
+        raise ValueError(f"{path}: expected a camera with the size of its image, got a matrix: see Camera.from_matrix")
+    return content
+
+
+def _of_json(path: Path, text: str) -> CameraFile:
     """Return the content of a ``camera.json`` of dsr, or a ``cam_params.json`` as NICE-SLAM's data sets have it."""
-    text = read_text(path)
     if '"camera"' in text or any(f'"{name}"' in text for name in _SCALES):
         params = (
             parse_model(_NestedParams, text, path).camera if '"camera"' in text else parse_model(_Params, text, path)
@@ -210,17 +200,22 @@ def _fit_to_photo(
 
 def scale_to_photo(path: Path, content: CameraFile, size: Size) -> tuple[CameraFile, list[Assumption]]:
     """Return a camera scaled to the photo's (height, width), and the assumptions; ``path`` is for the message."""
-    height, width = size
     camera = content.camera
     if (camera.height, camera.width) == size:
         return content, []
+    text = f"camera: that of {camera.width} x {camera.height} pixels is scaled to the photo's {size[1]} x {size[0]}"
+    return replace(content, camera=scale_camera(path, camera, size, "photo")), [Assumption(text)]
+
+
+def scale_camera(place: object, camera: Camera, size: Size, whose: str = "depth map") -> Camera:
+    """Return a camera scaled to a picture's (height, width); a message begins with ``place``."""
+    height, width = size
     if not same_aspect((camera.height, camera.width), size):
         raise ValueError(
-            f"{path}: the camera is of {camera.width} x {camera.height} pixels (width x height), the photo has "
+            f"{place}: the camera is of {camera.width} x {camera.height} pixels (width x height), the {whose} has "
             f"{width} x {height}, another aspect"
         )
-    text = f"camera: that of {camera.width} x {camera.height} pixels is scaled to the photo's {width} x {height}"
-    return replace(content, camera=camera.rescale(width, height)), [Assumption(text)]
+    return camera.rescale(width, height)
 
 
 def _camera_of_matrix(path: Path, matrix: np.ndarray, size: Size, size_lr: Size) -> tuple[CameraFile, list[Assumption]]:
@@ -270,26 +265,13 @@ def read_rig(files: RigFiles, size_lr: Size, baseline: float | None) -> Rig:
 
     ``baseline``: metres between the two cameras of disparities, if the map has such.
     """
-    height, width = size_lr
     content = read_any_camera(files.camera)
     if isinstance(content, np.ndarray):
-        camera = Camera(width, height, content[0, 0], content[1, 1], content[0, 2], content[1, 2], baseline)
+        camera = Camera(size_lr[1], size_lr[0], content[0, 0], content[1, 1], content[0, 2], content[1, 2])
     else:
-        camera = scale_to_depth(str(files.camera), content.camera, size_lr)
-    own = camera.baseline if baseline is None else baseline
-    camera = Camera(width, height, camera.fx, camera.fy, camera.cx, camera.cy, own, camera.doffs)
+        camera = scale_camera(files.camera, content.camera, size_lr)
+    camera = camera if baseline is None else replace(camera, baseline=baseline)
     return Rig(camera, read_transform(files.extrinsics))
-
-
-def scale_to_depth(place: str, camera: Camera, size_lr: Size) -> Camera:
-    """Return a depth camera scaled to the depth map's (height, width); a message begins with ``place``."""
-    height, width = size_lr
-    if not same_aspect((camera.height, camera.width), size_lr):
-        raise ValueError(
-            f"{place}: the camera is of {camera.width} x {camera.height} pixels (width x height), the depth map has "
-            f"{width} x {height}, another aspect"
-        )
-    return camera.rescale(width, height)
 
 
 def to_photo(depth_lr: Tensor, rig: Rig, photo: Camera, place: str) -> tuple[Tensor, Assumption]:

@@ -1,15 +1,17 @@
 """What is written beside an upsampled depth map: renderings, normals, a cloud and a mesh, and the input.
 
-A PLY file has points in the camera frame: x right, y down, z forward. glTF has y up and +z towards the viewer (Khronos,
-glTF 2.0 specification, section 3.4). The input, a copy of the depth map as it was read and of the photo, lets a result
-be looked at anywhere: its unit, holes and registration are not in the user's file alone.
+A PLY file has points in the camera frame: x right, y down, z forward. A GLB file has them with y up and z towards the
+viewer, and the photo as their texture (Khronos, glTF 2.0 specification, sections 3.4, 3.6 and 4.4): positions of 16
+bits and normals of 8 (``KHR_mesh_quantization``), of which a node's scale and translation make metres.
 """
 
 from __future__ import annotations
 
+import json
+import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -18,18 +20,9 @@ from torch import Tensor
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import LIGHT_NAMES
-from dsr.geometry.mesh import (
-    QUADRIC,
-    project,
-    select_points,
-    simplify,
-    thin,
-    triangulate,
-    vertex_normals,
-)
+from dsr.geometry.mesh import QUADRIC, project, select_points, simplify, thin, triangulate, vertex_normals
 from dsr.geometry.surface import depth_to_normals, render
-from dsr.io.glb import write_glb
-from dsr.io.photos import to_jpeg, write_png
+from dsr.io.photos import encode_png, to_jpeg, write_png
 from dsr.sample import expect_distances
 from dsr.utils.arrays import read_arrays
 from dsr.utils.decoding import decode_pixels
@@ -42,6 +35,14 @@ CAMERA_FRAME = "camera frame: x right, y down, z forward; metres"
 INPUT = "input.npz"
 LONGEST = 2048  # pixels of the longer side of the stored photo
 _STRIP = 1 << 20  # pixels whose normals are held in memory at a time
+_TO_GLTF = np.array([1, -1, -1])
+_STEPS = 65535
+_FINEST = 4e-4  # of the distance of the nearest point: largest step between positions; the rest has floats
+_LARGEST_TEXTURE = 4096  # pixels of a side, which every viewer supports
+_LOSSLESS = 2**16  # pixels of a texture that is stored without loss
+_QUALITY = 95  # of a JPEG with colours at half the resolution: at full resolution it takes 6 to 34 % more
+_TYPES = {"int8": 5120, "uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
+_ATTRIBUTES, _INDICES = 34962, 34963
 
 
 def world_comment(up: str) -> str:
@@ -150,8 +151,8 @@ def write_cloud(
     """
     mesh = triangulate(depth, camera, isolated=True)
     chosen, normals = select_points(mesh, most, camera), vertex_normals(mesh)
-    pixels = mesh.pixels[chosen]
-    write_ply(path, mesh.vertices[chosen], _colours(rgb, pixels), normals[chosen], filled=_at(filled, pixels))
+    colours, flags = _at(mesh.pixels[chosen], rgb, filled)
+    write_ply(path, mesh.vertices[chosen], colours, normals[chosen], filled=flags)
     fewer = len(chosen) < len(mesh.vertices)
     return Written(len(mesh.vertices), len(chosen), "leaving out rows and columns" if fewer else "")
 
@@ -166,20 +167,11 @@ def write_mesh(
     tolerance: Tensor | None = None,
     filled: Tensor | None = None,
 ) -> Written:
-    """Write the surface as a mesh with the photo's colours, cut at depth steps.
+    """Write the surface as a mesh with the photo's colours, cut at depth steps, as files ``.ply`` or ``.glb``.
 
-    A PLY file is in the camera frame (x right, y down, z forward) and has a colour at each vertex, a GLB file in glTF's
-    frame (x right, y up, z towards the viewer) with the photo as its texture, both in metres.
-
-    Args:
-        paths: one or several files, each ``.ply`` or ``.glb``.
-        rgb: (3, H, W) in [0, 1].
-        depth: (1, H, W) orthogonal depth in metres, NaN in holes.
-        camera: of these pixels.
-        most: triangles; a larger mesh is simplified, see :mod:`dsr.geometry.mesh`.
-        tolerance: see :func:`dsr.geometry.mesh.triangulate`.
-        filled: (1, H, W) bool, where depth was not measured; a GLB file has it as the attribute ``_FILLED``.
-
+    ``rgb``: (3, H, W) in [0, 1]. ``depth``: (1, H, W) orthogonal in metres, NaN in holes. A mesh of more than ``most``
+    triangles is simplified. ``tolerance``: see :func:`dsr.geometry.mesh.triangulate`. ``filled``, (1, H, W) bool, depth
+    that was not measured, is a property of a PLY file's points, and the attribute ``_FILLED`` of a GLB file.
     """
     paths = [paths] if isinstance(paths, Path) else list(paths)
     for path in paths:  # before anything is written
@@ -195,24 +187,118 @@ def write_mesh(
         except ImportError:
             mesh, stride = thin(depth, camera, most)
             how = f"a stride of {stride} pixels; {how_to_install('mesh')} simplifies and keeps more detail"
-    normals, missing = vertex_normals(mesh), _at(filled, mesh.pixels)
+    normals, (colours, flags) = vertex_normals(mesh), _at(mesh.pixels, rgb, filled)
     for path in paths:
         if path.suffix.lower() == ".ply":
-            write_ply(path, mesh.vertices, _colours(rgb, mesh.pixels), normals, mesh.faces, filled=missing)
+            write_ply(path, mesh.vertices, colours, normals, mesh.faces, filled=flags)
         else:
             places, photo = project(mesh.vertices, camera), _bytes(rgb).transpose(1, 2, 0).copy()
-            write_glb(path, mesh.vertices, normals, mesh.faces, places, photo, missing)
+            write_glb(path, mesh.vertices, normals, mesh.faces, places, photo, flags)
     return Written(before, len(mesh.faces), how)
 
 
-def _at(mask: Tensor | None, pixels: np.ndarray) -> np.ndarray | None:
-    """Return a mask's values at some pixels, (N,) bool; ``pixels`` are indices of the flattened map."""
-    return None if mask is None else mask.flatten().cpu().numpy()[pixels]
+def write_glb(
+    path: Path,
+    points: np.ndarray,
+    normals: np.ndarray,
+    faces: np.ndarray,
+    places: np.ndarray,
+    photo: np.ndarray,
+    filled: np.ndarray | None = None,
+) -> None:
+    """Write a mesh, in metres in the camera frame, as binary glTF atomically, with the photo as its texture.
+
+    ``faces``, (M, 3), one at least, are counterclockwise from outside. ``places``, (N, 2), are column and row of each
+    point in the photo, (H, W, 3) uint8. The material is rough and lit from both sides, so that viewers show the shape,
+    too. Positions are rounded to 1/65535 of the longest side of the mesh, half of which is 0.05 mm of a room of 6 m;
+    they are floats if half a step is more than 0.02 % of the nearest point's distance.
+    """
+    positions, node = points * _TO_GLTF, dict[str, Any]()
+    least, nearest = positions.min(axis=0), float(np.linalg.norm(points, axis=1).min(initial=np.inf))
+    step = float((positions.max(axis=0) - least).max()) / _STEPS  # one for all axes, as normals need it
+    if 0 < step <= _FINEST * nearest:
+        positions = np.rint((positions - least) / step).astype(np.uint16)
+        node = {"translation": least.tolist(), "scale": [step] * 3}
+    else:
+        positions = positions.astype(np.float32)
+    attributes = {
+        "POSITION": positions,
+        "NORMAL": np.rint(127 * normals * _TO_GLTF).astype(np.int8),
+        "TEXCOORD_0": ((places + 0.5) / photo.shape[1::-1]).astype(np.float32),
+        **({} if filled is None else {"_FILLED": filled.astype(np.uint8)[:, None]}),
+    }
+    file = _Glb()
+    primitive = {"attributes": {name: file.add(values, _ATTRIBUTES) for name, values in attributes.items()}}
+    bounds = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
+    file.accessors[primitive["attributes"]["POSITION"]] |= bounds
+    small = np.uint16 if len(points) <= _STEPS else np.uint32  # the last number of a type is none of a point
+    if photo.shape[0] * photo.shape[1] <= _LOSSLESS and max(photo.shape) <= _LARGEST_TEXTURE:
+        kind, picture = "image/png", encode_png(np.ascontiguousarray(photo[..., ::-1]))
+    else:
+        kind, picture = "image/jpeg", to_jpeg(photo, _LARGEST_TEXTURE, _QUALITY)
+    rough = {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    content = file.packed({
+        "asset": {"version": "2.0", "generator": "dsr"},
+        "extensionsUsed": ["KHR_mesh_quantization"],
+        "extensionsRequired": ["KHR_mesh_quantization"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, **node}],
+        "meshes": [{"primitives": [
+            {**primitive, "indices": file.add(faces.reshape(-1, 1).astype(small), _INDICES), "material": 0}
+        ]}],
+        "materials": [{"pbrMetallicRoughness": rough, "doubleSided": True}],
+        "textures": [{"source": 0, "sampler": 0}],
+        "samplers": [{"wrapS": 33071, "wrapT": 33071}],
+        "images": [{"mimeType": kind, "bufferView": file.view(picture)}],
+    })  # fmt: skip
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
 
 
-def _colours(rgb: Tensor, pixels: np.ndarray) -> np.ndarray:
-    """Return the photo's colours at some pixels, (N, 3) uint8; ``pixels`` are indices of the flattened map."""
-    return _bytes(rgb.flatten(1)[:, torch.from_numpy(pixels)]).T
+class _Glb:
+    """The binary part of a GLB file, whose parts begin at multiples of four bytes, and what is in it."""
+
+    def __init__(self) -> None:
+        self.accessors: list[dict[str, Any]] = []
+        self._views: list[dict[str, Any]] = []
+        self._content = bytearray()
+
+    def view(self, content: bytes, **entries: int) -> int:
+        """Add bytes, and return the number of their view."""
+        self._views.append({"buffer": 0, "byteOffset": len(self._content), "byteLength": len(content), **entries})
+        self._content += content + bytes(-len(content) % 4)
+        return len(self._views) - 1
+
+    def add(self, values: np.ndarray, target: int) -> int:
+        """Add numbers, (N, C), and return the number of their accessor."""
+        count, channels = values.shape
+        entries = {"target": target}
+        stride = channels * values.itemsize
+        if target == _ATTRIBUTES and stride % 4:
+            entries["byteStride"] = stride + -stride % 4
+            values = np.pad(values, ((0, 0), (0, (-stride % 4) // values.itemsize)))
+        number = self.view(values.astype(values.dtype.newbyteorder("<")).tobytes(), **entries)
+        kind = ("SCALAR", "VEC2", "VEC3")[channels - 1]
+        accessor = {"bufferView": number, "componentType": _TYPES[str(values.dtype)], "count": count, "type": kind}
+        self.accessors.append({**accessor, "normalized": True} if values.dtype == np.int8 else accessor)
+        return len(self.accessors) - 1
+
+    def packed(self, entries: dict[str, Any]) -> bytes:
+        """Return the whole file."""
+        tree = {**entries, "accessors": self.accessors, "bufferViews": self._views,
+                "buffers": [{"byteLength": len(self._content)}]}  # fmt: skip
+        text = json.dumps(tree, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        parts = struct.pack("<I4s", len(text), b"JSON") + text
+        parts += struct.pack("<I4s", len(self._content), b"BIN\0") + self._content
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(parts)) + parts
+
+
+def _at(pixels: np.ndarray, rgb: Tensor, filled: Tensor | None) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return colours, (N, 3) uint8, and values of a mask, (N,) bool, at some pixels, indices of the flattened map."""
+    flags = None if filled is None else filled.flatten().cpu().numpy()[pixels]
+    return _bytes(rgb.flatten(1)[:, torch.from_numpy(pixels)]).T, flags
 
 
 def _bytes(values: Tensor) -> np.ndarray:

@@ -16,9 +16,6 @@ from dsr.io.photos import read_photo
 from dsr.io.reading import Reading, parse_unit
 from dsr.notes import in_python, warn
 
-_NO_SIDE = (1, 1)
-"""Size of a depth map for which no photo is turned."""
-
 
 def read(path: str | os.PathLike[str], depth: np.ndarray | None = None) -> np.ndarray:
     """Read a photo as ``dsr upsample`` does.
@@ -50,7 +47,7 @@ def read(path: str | os.PathLike[str], depth: np.ndarray | None = None) -> np.nd
         (24, 32, 3)
 
     """
-    size_lr = _NO_SIDE if depth is None else (depth.shape[-2], depth.shape[-1])
+    size_lr = (1, 1) if depth is None else (depth.shape[-2], depth.shape[-1])  # for a square no photo is turned
     pixels, notes = read_photo(Path(path), size_lr)
     if depth is None:
         warn(notes)

@@ -12,20 +12,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, ParamSpec
 
-import cv2
 import numpy as np
 
 from dsr.geometry.camera import Camera, Lens
 from dsr.geometry.poses import Matrix
-from dsr.io.depth_files import DEPTH_SUFFIXES, read_array_file
-from dsr.io.images import Size, read_pixels
+from dsr.io.depth_files import DEPTH_SUFFIXES
+from dsr.io.images import Size, read_array
 from dsr.notes import Assumption
 from dsr.utils.guards import naming, pixels_beside
 
 Record = dict[str, str | int]  # identifies an input in info.json: name, SHA-256, and a frame's number if it has one
 HIGHEST_LEVEL = 2  # of ARKit's confidence: 0 (low), 1 (medium) and 2 (high)
 SLACK = 0.002  # fractions count as equal within this: 127 of 255 is a half
-_ARRAYS = (".npy", ".npz", ".pfm", ".exr")
 CONFIDENCE_SUFFIXES = (*DEPTH_SUFFIXES, ".bmp")
 UPS = ("", "y", "z")  # axes of a capture's world that point up; "" where it does not say
 _Arguments = ParamSpec("_Arguments")
@@ -179,8 +177,7 @@ def _read_values(path: Path, most: int | None = None) -> np.ndarray:
     """Return a confidence map as it is stored, (h, w)."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a confidence map, there is no such file")
-    array = path.suffix.lower() in _ARRAYS
-    values = read_array_file(path, most) if array else read_pixels(path, cv2.IMREAD_UNCHANGED, most)
+    values = read_array(path, most)
     if values.ndim != 2 or values.dtype.kind not in "fiub" or not values.size:
         raise ValueError(f"{path}: expected one channel of numbers, got {values.dtype} of shape {values.shape}")
     return values

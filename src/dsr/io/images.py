@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +15,8 @@ import numpy as np
 from pydantic import Field
 
 from dsr.notes import Assumption
-from dsr.utils.decoding import decode_pixels, format_not_read, picture_size
+from dsr.utils.arrays import array_headers, read_arrays
+from dsr.utils.decoding import QUIET_DECODERS, decode_pixels, format_not_read, picture_size
 from dsr.utils.guards import (
     MOST_FILE,
     expect_pixels,
@@ -78,8 +82,8 @@ def read_values(path: Path, most: int | None = None) -> np.ndarray:
 
 
 def read_array(path: Path, most: int | None = None) -> np.ndarray:
-    """Return the values of a picture, PFM or NPY file in the type and shape that they are stored in."""
-    readers = {".npy": _load_npy, ".pfm": _load_pfm}
+    """Return the values of a picture, NPY, NPZ, PFM or OpenEXR file in the type and shape that they are stored in."""
+    readers = {".npy": _read_npy, ".npz": _read_npz, ".pfm": _read_pfm, ".exr": _read_exr}
     if path.suffix.lower() not in readers:
         return read_pixels(path, cv2.IMREAD_UNCHANGED, most)
     values = readers[path.suffix.lower()](path)
@@ -90,27 +94,15 @@ def read_array(path: Path, most: int | None = None) -> np.ndarray:
 
 def expect_depth_values(path: Path, values: np.ndarray) -> np.ndarray:
     """Return the values of a depth file if they are (H, W), floats or whole numbers of 16 bits or more."""
-    what = f": {_describe_picture(values)}" if values.dtype in (np.uint8, np.uint16) else ""
     if values.ndim != 2:
+        what = ": a photo, or a picture for viewing" if values.dtype in (np.uint8, np.uint16) else ""
         raise ValueError(f"{path}: expected one channel (height x width), got shape {values.shape}{what}")
     if values.dtype.kind not in "fiu" or (values.dtype.kind in "iu" and values.dtype.itemsize == 1):
+        what = ": a picture for viewing, or disparities of an old benchmark" if values.dtype == np.uint8 else ""
         raise ValueError(
             f"{path}: expected 16-bit or floating point values, got {values.dtype} (too coarse for depth){what}"
         )
     return values
-
-
-def _describe_picture(values: np.ndarray) -> str:
-    """Describe what a picture of several channels, or of 8 bits, probably shows."""
-    if values.ndim == 2:
-        return "a picture for viewing, or disparities of an old benchmark"
-    if values.ndim == 3 and values.shape[2] == 2:
-        return "grey that is transparent in places"
-    if values.ndim != 3 or values.shape[2] not in (3, 4) or not values.size:
-        return "no map"
-    if (values[..., :3] == values[..., :1]).all():
-        return "three equal channels, a grey picture for viewing"
-    return "a picture in colour, a photo or a map coloured for viewing"
 
 
 def read_levels(path: Path) -> np.ndarray:
@@ -148,7 +140,7 @@ def _content(path: Path) -> bytes:
     return read_limited(path, MOST_FILE)
 
 
-def _load_pfm(path: Path) -> np.ndarray:
+def _read_pfm(path: Path) -> np.ndarray:
     """Return a PFM file's values as they are, (H, W).
 
     The header's scale says the byte order by its sign; its magnitude, which OpenCV multiplies by, is left alone, as the
@@ -168,12 +160,63 @@ def _load_pfm(path: Path) -> np.ndarray:
     return np.frombuffer(pixels, "<f4" if scale < 0 else ">f4").reshape(height, width)[::-1]
 
 
-def _load_npy(path: Path) -> np.ndarray:
+def _read_npy(path: Path) -> np.ndarray:
     if not path.is_file():
         raise ValueError(f"{path}: expected a file, there is none")
     # a damaged header makes NumPy raise OSError, MemoryError, TokenError, ...
     with refusing(f"{path}: expected a NumPy array, got a damaged or foreign file", Exception), path.open("rb") as file:
         return np.lib.format.read_array(file, allow_pickle=False)
+
+
+def _read_npz(path: Path) -> np.ndarray:
+    """Return the array named depth, or the only one."""
+    names = sorted(array_headers(path))
+    if len(names) != 1 and "depth" not in names:
+        raise ValueError(f"{path}: expected one array, or one named depth; got {', '.join(names) or 'none'}")
+    name = names[0] if len(names) == 1 else "depth"
+    return read_arrays(path, (name,))[name]
+
+
+def _read_exr(path: Path) -> np.ndarray:
+    """Return the depth channel of an OpenEXR file; see https://openexr.com/en/latest/StandardOptions.html."""
+    import OpenEXR  # noqa: PLC0415 - only where somebody has such a file
+
+    channels, windows = {}, {}
+    # damaged files raise RuntimeError, ValueError, MemoryError, ..., and print on both streams
+    with refusing(f"{path}: expected an OpenEXR file, got a damaged or foreign one", Exception):
+        quiet = contextlib.redirect_stdout(io.StringIO())
+        with QUIET_DECODERS, quiet, OpenEXR.File(str(path), separate_channels=True) as file:
+            for number in reversed(range(len(file.parts))):
+                corners = (file.parts[number].header[name] for name in ("dataWindow", "displayWindow"))
+                ends = [(least.astype(int).tolist(), most.astype(int).tolist()) for least, most in corners]
+                for name, channel in file.channels(number).items():
+                    channels[name], windows[name] = channel.pixels, ends
+    chosen = _depth_channel(path, channels)
+    values = channels[chosen]
+    # rows and columns of the pixels that are stored, and of those that are shown
+    stored, shown = ([range(least[axis], most[axis] + 1) for axis in (1, 0)] for least, most in windows[chosen])
+    if stored == shown or values.shape != tuple(map(len, stored)) or 0 in map(len, shown):
+        return values
+    expect_pixels(path, len(shown[0]), len(shown[1]))
+    whole = np.full([len(each) for each in shown], np.nan if values.dtype.kind == "f" else 0, values.dtype)
+    inside = [np.isin(each, there) for each, there in zip(shown, stored, strict=True)]
+    within = [np.isin(each, there) for each, there in zip(stored, shown, strict=True)]
+    whole[np.ix_(*inside)] = values[np.ix_(*within)]
+    return whole
+
+
+def _depth_channel(path: Path, channels: Iterable[str]) -> str:
+    """Return which channel holds depth."""
+    last = {name: name.rpartition(".")[2].lower() for name in sorted(channels)}
+    for wanted in ("z", "depth", "y"):
+        found = [name for name, short in last.items() if short == wanted]
+        if found:
+            return min(found, key=len)
+    if len(last) == 1:
+        return next(iter(last))
+    if "R" in last:
+        return "R"
+    raise ValueError(f"{path}: expected a channel named Z, Y or R, got {', '.join(last) or 'none'}")
 
 
 def read_pixels(path: Path, flags: int, most: int | None = None) -> np.ndarray:

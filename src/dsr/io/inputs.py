@@ -23,12 +23,20 @@ from dsr.io.cameras import (
     find_camera,
     read_any_camera,
     read_rig,
-    scale_to_depth,
+    scale_camera,
     scale_to_photo,
     to_photo,
 )
-from dsr.io.depth_files import ICL_CAMERA, ICL_SUFFIX, read_depth_file
-from dsr.io.encoding import Encoding, decode, expect_known, find_holes, turn_back_bits
+from dsr.io.depth_files import (
+    ICL_CAMERA,
+    ICL_SUFFIX,
+    Encoding,
+    decode,
+    expect_known,
+    find_holes,
+    read_depth_file,
+    turn_back_bits,
+)
 from dsr.io.frames import SLACK, Geometry, Rig
 from dsr.io.images import Size, pixels_in_header, read_mask
 from dsr.io.pairs import Pair, find_camera_file, role_of_words, words_of
@@ -184,7 +192,7 @@ def read_map(path: Path, reading: Reading, camera: Camera | None = None) -> tupl
     own = content if isinstance(content, CameraFile) else None
     if own is None:
         own = CameraFile(ICL_CAMERA if _is_icl(pair) else Camera.from_fov(ASSUMED_FOV, size[1], size[0]))
-    of_depth = scale_to_depth(str(pair.camera or path) if camera is None else "camera", camera or own.camera, size)
+    of_depth = scale_camera(str(pair.camera or path) if camera is None else "camera", camera or own.camera, size)
     of_depth = replace(of_depth, baseline=reading.baseline or of_depth.baseline)
     values = _interpret(pair, reading, own, stored, FolderUnits(), of_depth)
     range_type = values.encoding.range_type
@@ -376,7 +384,7 @@ def _rig(pair: Pair, reading: Reading, geometry: Geometry, size_lr: Size) -> Rig
         return read_rig(reading.rig, size_lr, reading.baseline)
     if pair.capture is None or geometry.rig is None:
         return None
-    camera = scale_to_depth(str(pair.capture.description), geometry.rig.camera, size_lr)
+    camera = scale_camera(str(pair.capture.description), geometry.rig.camera, size_lr)
     return geometry.rig._replace(camera=replace(camera, baseline=reading.baseline or camera.baseline))
 
 

@@ -27,7 +27,6 @@ from dsr.io.captures.registry import CAPTURE_FILES, find_capture, lacking
 from dsr.io.depth_files import DEPTH_SUFFIXES
 from dsr.io.frames import CaptureFrame, Geometry
 from dsr.io.images import read_pixels
-from dsr.io.open3d import add_trajectory
 from dsr.io.pairs import (
     Pair,
     PairingResult,
@@ -43,7 +42,7 @@ from dsr.io.pairs import (
     role_of_words,
     words_of,
 )
-from dsr.io.trajectories import read_poses
+from dsr.io.trajectories import add_trajectory, read_poses
 from dsr.notes import Assumption
 from dsr.utils.guards import naming, natural_key, numbers_in, path_within, read_text, split_numbers
 

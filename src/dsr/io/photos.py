@@ -22,7 +22,7 @@ from PIL import Image
 from dsr.io.images import Size, read_colours
 from dsr.notes import Assumption
 from dsr.utils.files import replacing
-from dsr.utils.guards import MOST_FILE, expect_pixels, read_limited, refusing
+from dsr.utils.guards import MOST_FILE, expect_pixels, opened, read_limited, refusing
 from dsr.utils.versions import how_to_install
 
 HEIC_SUFFIXES = (".heic", ".heif")
@@ -159,7 +159,7 @@ def _exif(photo: Path) -> dict[int, Any]:
                 exif = Image.Exif()
                 exif.load(open_heic(photo).info["exif"])
             else:
-                with Image.open(photo) as image:
+                with opened(photo) as file, Image.open(file) as image:
                     exif = image.getexif()
             return {**dict(exif), **exif.get_ifd(_EXIF_IFD)}
     except Exception:  # damaged data are ignored

@@ -1,7 +1,7 @@
-"""Frames as other programs read them: nerfstudio's ``transforms.json``, 3D Gaussian Splatting, and rerun.
+"""Frames as other programs read them: Open3D, nerfstudio's ``transforms.json``, 3D Gaussian Splatting, and rerun.
 
-dsr's cameras have x right, y down, z forward, and pixel centres at integers; all three count the principal point from
-the corner of the image, half a pixel more. :mod:`dsr.io.open3d` has the fourth.
+dsr's cameras have x right, y down, z forward, and pixel centres at integers, as Open3D's have; the others count the
+principal point from the corner of the image, half a pixel more.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from dsr.io.exports import world_comment, write_ply
 from dsr.io.images import read_pixels
 from dsr.io.photos import encode_png, to_jpeg, write_png
 from dsr.io.trajectories import check_pose
+from dsr.notes import Assumption
 from dsr.utils.files import replacing, write_text
 from dsr.utils.guards import pixels_beside, refusing
 from dsr.utils.versions import how_to_install
@@ -37,26 +38,15 @@ _POINTS = 100_000  # of all frames together, from which an optimisation starts
 
 @dataclass(frozen=True)
 class Frame:
-    """A photo and a depth map of one size.
+    """A photo and a depth map of one size."""
 
-    Args:
-        name: the frame's, perhaps with folders: ``kitchen/000012``.
-        camera: of the pixels.
-        pose: (4, 4) float64 camera-to-world transform in metres; None if it is not known.
-        colour: an 8-bit PNG.
-        depth: a file of (H, W) orthogonal depth in metres, NaN in holes.
-        up: the axis of the world that points up, one of :data:`dsr.io.frames.UPS`.
-        time: of the frame in seconds; None if it is not known.
-
-    """
-
-    name: str
+    name: str  # perhaps with folders: kitchen/000012
     camera: Camera
-    pose: Tensor | None
-    colour: Path
-    depth: Path
-    up: str = ""
-    time: float | None = None
+    pose: Tensor | None  # (4, 4) float64 camera to world in metres; None if it is not known
+    colour: Path  # an 8-bit PNG
+    depth: Path  # a file of (H, W) orthogonal depth in metres, NaN in holes
+    up: str = ""  # the axis of the world that points up, one of dsr.io.frames.UPS
+    time: float | None = None  # in seconds
 
     @property
     def stem(self) -> str:
@@ -81,15 +71,6 @@ class Frame:
         most = pixels_beside(self.camera.height, self.camera.width)
         return read_pixels(self.colour, cv2.IMREAD_COLOR, most)[..., ::-1]
 
-    def copy_colour(self, path: Path) -> None:
-        """Copy the photo, atomically."""
-        with replacing(path) as temporary:
-            shutil.copyfile(self.colour, temporary)
-
-    def write_millimetres(self, path: Path) -> None:
-        """Write the depth as a PNG of 16-bit millimetres, 0 in holes."""
-        write_png(path, to_millimetres(self.read_depth())[0])
-
 
 def parse_pose(where: str, value: object) -> Tensor | None:
     """Return a camera-to-world transform, (4, 4) float64, that JSON holds as a list of lists; None for none."""
@@ -99,16 +80,14 @@ def parse_pose(where: str, value: object) -> Tensor | None:
         return torch.from_numpy(check_pose(where, np.array(value, dtype=np.float64)))
 
 
-def one_camera(frames: Sequence[Frame]) -> Camera | None:
+def _common_camera(frames: Sequence[Frame]) -> Camera | None:
     """Return the camera of all frames, or None if they differ."""
-    cameras = {frame.camera for frame in frames}
-    return cameras.pop() if len(cameras) == 1 else None
+    return frames[0].camera if len({frame.camera for frame in frames}) == 1 else None
 
 
-def common_up(frames: Sequence[Frame]) -> str:
+def _common_up(frames: Sequence[Frame]) -> str:
     """Return the axis that points up in the world of all frames, or "" if they differ."""
-    ups = {frame.up for frame in frames}
-    return ups.pop() if len(ups) == 1 else ""
+    return frames[0].up if len({frame.up for frame in frames}) == 1 else ""
 
 
 def to_millimetres(depth: np.ndarray) -> tuple[np.ndarray, int]:
@@ -131,6 +110,59 @@ def expect_poses(part: str, known: Mapping[str, bool]) -> None:
         )
 
 
+def _write_pictures(folder: Path, kinds: tuple[str, str], frame: Frame, values: np.ndarray) -> list[Path]:
+    """Write the photo and values of the depth, (H, W) uint16, of a frame into two folders, and return the files."""
+    photo, depth = (folder / kind / f"{frame.stem}.png" for kind in kinds)
+    with replacing(photo) as temporary:
+        shutil.copyfile(frame.colour, temporary)
+    write_png(depth, values)
+    return [photo, depth]
+
+
+def write_rgbd(folder: Path, rgb: Tensor, depth: Tensor, camera: Camera) -> list[Assumption]:
+    """Write ``color.png``, ``depth.png`` and ``intrinsic.json`` of one frame; note pixels that are too far for 16 bits.
+
+    ``rgb``: (3, H, W) in [0, 1]. ``depth``: (1, H, W) in metres, NaN in holes.
+    """
+    millimetres, lost = to_millimetres(depth[0].cpu().numpy())
+    pixels = (rgb * 255).round().clamp(0, 255).byte().permute(1, 2, 0).cpu().numpy()
+    write_png(folder / RGBD[0], np.ascontiguousarray(pixels[..., ::-1]))
+    write_png(folder / RGBD[1], millimetres)
+    _write_intrinsics(folder / RGBD[2], camera)
+    if not lost:
+        return []
+    return [Assumption(f"{folder.name}/{RGBD[1]}: what is beyond 65.5 m is written as a hole", f"{lost} pixels")]
+
+
+def write_open3d(folder: Path, frames: Sequence[Frame]) -> list[Path]:
+    """Write a folder as Open3D expects it, with a PNG for each frame in ``color/`` and ``depth/``.
+
+    ``intrinsic.json`` is the camera, or ``intrinsics/`` that of each frame if they differ. ``trajectory.log`` has the
+    poses, if all frames have one.
+    """
+    files, rows = list[Path](), list[str]()
+    for number, frame in enumerate(frames):
+        files += _write_pictures(folder, ("color", "depth"), frame, to_millimetres(frame.read_depth())[0])
+        rows.append(f"{number} {number} {number + 1}\n")
+        rows += (" ".join(f"{value:.12g}" for value in row) + "\n" for row in frame.matrix)
+    camera = _common_camera(frames)
+    cameras = {f"intrinsics/{frame.stem}.json": frame.camera for frame in frames}
+    for name, each in (cameras if camera is None else {RGBD[2]: camera}).items():
+        files.append(folder / name)
+        _write_intrinsics(files[-1], each)
+    if all(frame.pose is not None for frame in frames):
+        files.append(folder / "trajectory.log")
+        write_text(files[-1], "".join(rows))
+    return files
+
+
+def _write_intrinsics(path: Path, camera: Camera) -> None:
+    """Write Open3D's JSON of a camera."""
+    matrix = [camera.fx, 0.0, 0.0, 0.0, camera.fy, 0.0, camera.cx, camera.cy, 1.0]
+    entries = {"width": camera.width, "height": camera.height, "intrinsic_matrix": matrix}
+    write_text(path, json.dumps(entries, indent=2) + "\n")
+
+
 def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
     """Write ``transforms.json``, and beside it ``nerfstudio/`` with ``images/``, ``depths/`` and ``points.ply``.
 
@@ -141,23 +173,17 @@ def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
     millimetres by default; ``depth_unit_scale_factor`` states it for other readers.
     """
     expect_poses("nerfstudio", {frame.name: frame.pose is not None for frame in frames})
-    camera, folder = one_camera(frames), path.parent / "nerfstudio"
+    camera, folder = _common_camera(frames), path.parent / "nerfstudio"
     points = folder / "points.ply"
-    write_ply(points, *_sparse(frames), frame=world_comment(common_up(frames)))
+    write_ply(points, *_sparse(frames), frame=world_comment(_common_up(frames)))
     files, entries = list[Path](), list[dict[str, Any]]()
     for frame in frames:
-        photo, depth = (folder / kind / f"{frame.stem}.png" for kind in ("images", "depths"))
-        frame.copy_colour(photo)
-        frame.write_millimetres(depth)
-        files += [photo, depth]
-        entries.append(
-            {
-                "file_path": photo.relative_to(path.parent).as_posix(),
-                "depth_file_path": depth.relative_to(path.parent).as_posix(),
-                **({} if camera is not None else _intrinsics(frame.camera)),
-                "transform_matrix": (frame.matrix * [1, -1, -1, 1]).tolist(),
-            }
-        )
+        pictures = _write_pictures(folder, ("images", "depths"), frame, to_millimetres(frame.read_depth())[0])
+        photo, depth = (each.relative_to(path.parent).as_posix() for each in pictures)
+        own = {} if camera is not None else _intrinsics(frame.camera)
+        pose = (frame.matrix * [1, -1, -1, 1]).tolist()
+        entries.append({"file_path": photo, "depth_file_path": depth, **own, "transform_matrix": pose})
+        files += pictures
     content = {
         "camera_model": "OPENCV",
         **({} if camera is None else _intrinsics(camera)),
@@ -199,11 +225,9 @@ def write_splatting(folder: Path, frames: Sequence[Frame]) -> list[Path]:
     scale = 65536 / _STEPS / nearest
     files = list[Path]()
     for frame in frames:
-        photo, depth = (folder / kind / f"{frame.stem}.png" for kind in ("images", "depths"))
-        frame.copy_colour(photo)
-        inverse = 65536 / (scale * frame.read_depth().astype(np.float64))
-        write_png(depth, np.nan_to_num(np.rint(inverse), nan=0, posinf=0).astype(np.uint16))
-        files += [photo, depth]
+        inverse = np.rint(65536 / (scale * frame.read_depth().astype(np.float64)))
+        values = np.nan_to_num(inverse, nan=0, posinf=0).astype(np.uint16)
+        files += _write_pictures(folder, ("images", "depths"), frame, values)
     parameters = {frame.stem: {"scale": scale, "offset": 0.0} for frame in frames}
     texts = {"depth_params.json": json.dumps(parameters, indent=2) + "\n"}
     if all(frame.pose is not None for frame in frames):
@@ -262,7 +286,7 @@ def write_rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:
     recording = rerun.RecordingStream("dsr")
     with replacing(path) as temporary:
         recording.save(str(temporary))
-        axes = {"": "RDF", "y": "RUB", "z": "RFU"}[common_up(frames)]
+        axes = {"": "RDF", "y": "RUB", "z": "RFU"}[_common_up(frames)]
         recording.log("/", getattr(rerun.ViewCoordinates, axes), static=True)
         timed = all(frame.time is not None for frame in frames)
         for number, frame in enumerate(frames):

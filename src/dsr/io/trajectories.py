@@ -12,8 +12,9 @@ import numpy as np
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.plausible import may_be_of
-from dsr.geometry.poses import Matrix, as_rigid, from_quaternion, is_rotation
-from dsr.io.pairs import Pair
+from dsr.geometry.poses import Matrix, as_rigid, from_quaternion
+from dsr.io.frames import CaptureFrame, Geometry, stated
+from dsr.io.pairs import Pair, PairingResult
 from dsr.notes import Assumption
 from dsr.utils.guards import naming, numbers_in, parse_json, read_text, refusing, split_numbers
 
@@ -22,25 +23,18 @@ _MAX_GAP = 0.02  # seconds between a frame and its pose
 _MOST_BETWEEN = 10.0  # metres between the two cameras of a rig; more is taken for millimetres
 NO_POSE = Assumption("no pose: the capture has none of the frame")
 USUAL_SIZE = (1440, 1920)  # height and width of iPhones' photos, for photos that were made smaller
+_OPEN3D_FILES = ("scene/trajectory.log", "trajectory.log")
 _ARKIT_TO_DSR = np.diag([1.0, -1.0, -1.0, 1.0])  # ARKit's and OpenGL's camera looks along -z with y up; dsr's along z
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses in a file.
-
-    Args:
-        file: the file.
-        poses: camera to world, 4 x 4, metres, in order; None where tracking was lost: NaN, infinite or all 0.
-        times: time of each in seconds, or its frame's number; None where the file has none.
-        ids: number of each frame, RTAB-Map's ninth column; None where the file has none.
-
-    """
+    """Poses in a file."""
 
     file: Path
-    poses: tuple[Matrix | None, ...]
-    times: tuple[float, ...] | None = None
-    ids: tuple[float, ...] | None = None
+    poses: tuple[Matrix | None, ...]  # camera to world, metres; None where tracking was lost: NaN, infinite or all 0
+    times: tuple[float, ...] | None = None  # of each in seconds, or its frame's number; None where the file has none
+    ids: tuple[float, ...] | None = None  # number of each frame, RTAB-Map's ninth column
 
     def assign(self, pairs: Sequence[Pair]) -> Mapping[str, Matrix]:
         """Return the poses of frames by their names, without those of frames that have none.
@@ -50,9 +44,9 @@ class Trajectory:
         frames, the first of these if several do. Those of frames without times are else taken in order.
         """
         if self.times is not None:
-            named = _known([pair.named_time for pair in pairs])
-            own = _known([pair.time for pair in pairs])
-            numbers = _known([_number(pair) for pair in pairs])
+            named = np.array([pair.named_time for pair in pairs], np.float64)  # None becomes NaN
+            own = np.array([pair.time for pair in pairs], np.float64)
+            numbers = np.array([_number(pair) for pair in pairs], np.float64)
             ways = [(own, _MAX_GAP), *(way for way in ((named, _MAX_GAP), (numbers, 0.0)) if np.isfinite(way[0]).all())]
             found = [self._nearest(pairs, *way) for way in ways]
             if self.ids is not None:
@@ -186,11 +180,6 @@ def _matrix_of_json(path: Path, text: str) -> list[list[float]]:
     return content
 
 
-def _known(times: Sequence[float | None]) -> np.ndarray:
-    """Return times, (frames,) float64, NaN where there is none."""
-    return np.array([math.nan if time is None else time for time in times], dtype=np.float64)
-
-
 def _number(pair: Pair) -> float | None:
     """Return the last number in a frame's name; None if it is the fraction of a time."""
     numbers = re.findall(r"\d+", pair.depth.stem)
@@ -207,18 +196,15 @@ def pose_from_quaternion(
     ``source`` is the file and the place in it. ``opengl``: the camera's axes are x right, y up, z backward, as ARKit
     and OpenGL have them, in place of x right, y down, z forward.
     """
-    came = " ".join(f"{value:g}" for value in (*quaternion, *position))
-    with refusing(f"{source}: expected a rigid pose (a quaternion of length 1 and a position), got {came}", ValueError):
-        pose = from_quaternion(position, quaternion, source)
+    pose = from_quaternion(position, quaternion, source)
     return pose @ _ARKIT_TO_DSR if opengl else pose
 
 
 def check_pose(source: str, matrix: np.ndarray, *, opengl: bool = False) -> np.ndarray:
     """Return a rigid transform (4, 4) from camera to world as it is; see :func:`pose_from_quaternion`."""
-    finite = matrix.shape == (4, 4) and bool(np.isfinite(matrix).all())
-    if not finite or not is_rotation(matrix[:3, :3]) or not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
-        came = " ".join(f"{value:.4g}" for value in matrix.ravel())
-        raise ValueError(f"{source}: expected a rigid pose (a rotation and a position), got {came}")
+    if matrix.shape != (4, 4):
+        raise ValueError(f"{source}: expected a matrix of 4 x 4 numbers, got {' x '.join(map(str, matrix.shape))}")
+    as_rigid(matrix, source)
     return matrix @ _ARKIT_TO_DSR if opengl else matrix
 
 
@@ -249,3 +235,42 @@ def describe_capture(app: str, unit: str, pairs: Sequence[Pair], *, poses: bool)
     parts = ["intrinsics", *(["poses"] if poses else [])]
     parts += ["confidence"] if any(pair.confidence is not None for pair in pairs) else []
     return Assumption(f"{app}: depth in {unit}; from the capture: {', '.join(parts)}")
+
+
+def add_trajectory(folder: Path, found: PairingResult) -> PairingResult:
+    """Return the pairs of a folder with the poses of the trajectory of Open3D's reconstruction system, if it fits.
+
+    That is a line of three whole numbers and the four rows of the pose for each frame
+    (http://redwood-data.org/indoor/fileformat.html): the n-th pose, by the first of the three, is of the n-th photo.
+    """
+    path = next((folder / name for name in _OPEN3D_FILES if (folder / name).is_file()), None)
+    if path is None or not found.pairs:
+        return found
+    lines = [line for line in read_text(path).splitlines() if line.strip()]
+    try:
+        if len(lines) % 5 or any(len(line.split()) != 3 for line in lines[::5]):
+            raise ValueError
+        order = order_of([int(line.split()[0]) for line in lines[::5]])
+    except ValueError:
+        raise ValueError(
+            f"{path}: expected a line of three whole numbers and four of a matrix for each pose, got {len(lines)} lines"
+        ) from None
+    if found.unpaired or len(order) != len(found.pairs):
+        text = f"no poses: {path.name} has {len(order)}, for {len(found.pairs)} pairs"
+        text += f" and {len(found.unpaired)} pictures without a partner" if found.unpaired else ""
+        return replace(found, assumptions=(*found.assumptions, Assumption(text)))
+    pairs: list[Pair] = []
+    for rank, (pair, place) in enumerate(zip(found.pairs, order, strict=True)):
+        rows = tuple(lines[5 * place + 1 : 5 * place + 5])
+        geometry = stated(_geometry_of_log, f"{path}: pose {rank}", rows)
+        pairs.append(replace(pair, capture=CaptureFrame("Open3D", geometry, path, "\n".join(rows).encode())))
+    text = f"poses: {path.relative_to(folder).as_posix()} of Open3D, one for each photo"
+    return replace(found, pairs=tuple(pairs), assumptions=(*found.assumptions, Assumption(text)))
+
+
+def _geometry_of_log(place: str, rows: tuple[str, ...]) -> Geometry:
+    """Return the pose of a frame; its camera is read from the file beside the pictures."""
+    values = [numbers_in(row.split()) for row in rows]
+    if [len(row) for row in values] != [4] * 4:
+        raise ValueError(f"{place}: expected a matrix of 4 x 4 numbers, got {' '.join(rows)!r:.80}")
+    return Geometry(None, check_pose(place, np.array(values)))

@@ -13,7 +13,7 @@ import numpy as np
 
 from dsr.geometry.camera import Camera, RangeType, baseline_times_focal
 from dsr.geometry.planes import InverseVotes, inverse_votes
-from dsr.io.encoding import expect_known
+from dsr.io.depth_files import expect_known
 from dsr.io.reading import SUNRGBD_BITS
 from dsr.notes import LIMITS, Assumption
 from dsr.utils.progress import show_length
@@ -46,16 +46,12 @@ _KITTI_WIDTHS, _KITTI_HEIGHTS = range(1216, 1243), range(350, 377)  # whose dept
 
 
 class Meaning(NamedTuple):
-    """The meaning of stored values: metres (pixels) per value, assumptions, range type, and rotated bits.
+    """The meaning of stored values."""
 
-    ``range_type``: ``disparity`` where the values are; None where they show none. ``bits``: how far they were turned
-    to the left; the unit holds after turning them back.
-    """
-
-    unit: float
+    unit: float  # metres (pixels) per value
     assumptions: tuple[Assumption, ...]
-    range_type: RangeType | None = None
-    bits: int = 0
+    range_type: RangeType | None = None  # disparity where the values are; None where they show none
+    bits: int = 0  # how far they were turned to the left; the unit holds after turning them back
 
 
 def interpret(
@@ -63,15 +59,8 @@ def interpret(
 ) -> Meaning:
     """Identify the unit and the range type of the stored values of a map, (h, w), with holes, (h, w) bool.
 
-    An error begins with ``name``; if two readings are as likely, it names both, with the option for each.
-
-    Args:
-        name: name of the file.
-        values: as stored.
-        holes: where depth is missing.
-        camera: of these pixels; None for an unknown one.
-        may_fall: whether they may be disparities: nobody said that they are not.
-
+    An error begins with ``name``, the file's; if two readings are as likely, it names both, with the option for each.
+    ``camera``: of these pixels, if it is known. ``may_fall``: nobody said that they are no disparities.
     """
     expect_known(name, values, holes)
     known = values[~holes]
@@ -173,17 +162,15 @@ def _by_data_set(seen: _Map) -> Meaning | None:
         if camera is not None and camera.width == known_width and np.allclose((camera.fx, camera.fy), (fx, fy), 1e-4):
             return Meaning(unit, (_whole(seen, "1/5000 m", unit, f"the camera is that of {name}"),))
     if (width, height) == _REPLICA and seen.middle / 6553.5 > 0.5:
-        return Meaning(
-            1 / 6553.5, (_whole(seen, "1/6553.5 m", 1 / 6553.5, "1200 x 680 is the size of Replica's maps"),)
-        )
+        note = _whole(seen, "1/6553.5 m", 1 / 6553.5, "1200 x 680 is the size of Replica's maps")
+        return Meaning(1 / 6553.5, (note,))
     if seen.of_kitti and seen.sparse:
         return Meaning(1 / 256, (_whole(seen, "1/256 m", 1 / 256, "size and holes are those of KITTI's maps"),))
     if seen.of_kitti:
         seen.ask("KITTI's maps have this size, and store 1/256 m", ("1/256", 1 / 256), ("mm", 1e-3), ("cm", 1e-2))
     if seen.scattered:
-        seen.ask(
-            "single pixels, as of a laser scanner, which KITTI stores in 1/256 m", ("1/256", 1 / 256), ("mm", 1e-3)
-        )
+        why = "single pixels, as of a laser scanner, which KITTI stores in 1/256 m"
+        seen.ask(why, ("1/256", 1 / 256), ("mm", 1e-3))
     return None
 
 
@@ -223,8 +210,7 @@ def _by_median(seen: _Map) -> Meaning:
             text = "everything is near if whole numbers are millimetres: are they centimetres? --depth-unit mm or cm"
             found.append(Assumption(text, f"99 % within {show_length(near, 2)}", "near-millimetres", near))
         if seen.sparse and not _compact(seen.holes):
-            text = "that is sparse, as of a laser scanner: KITTI stores 1/256 m (--depth-unit 1/256)"
-            found.append(Assumption(text))
+            found.append(Assumption("that is sparse, as of a laser scanner: KITTI stores 1/256 m (--depth-unit 1/256)"))
         return Meaning(1e-3, tuple(found))
     for unit, label in _OTHER_UNITS:
         if _MIN_MEDIAN <= middle * unit <= _MAX_MEDIAN:
@@ -261,9 +247,8 @@ def _expect_metric(seen: _Map) -> None:
         ends = ((seen.values == end).sum() for end in (0, highest))
         normalised = highest == round(highest) and all(0 < count <= _ENDS for count in ends)
     else:
-        of_levels = any(
-            np.allclose(known * most, np.round(known * most), 0, 1e-3 * most / 255) for most in (255, 65535)
-        )
+        scaled = ((known * most, 1e-3 * most / 255) for most in (255, 65535))
+        of_levels = any(np.allclose(each, np.round(each), 0, allowed) for each, allowed in scaled)
         normalised = highest == 1 or of_levels or seen.middle < _MIN_MEDIAN
     if normalised and not (known == np.round(known)).all():
         raise ValueError(

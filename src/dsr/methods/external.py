@@ -20,8 +20,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, interpolate
 
 from dsr.geometry.camera import RANGE_TYPES, Camera, RangeType, from_range, to_range
-from dsr.io.depth_files import DEPTH_SUFFIXES, read_depth_file
-from dsr.io.encoding import expect_known, find_holes
+from dsr.io.depth_files import DEPTH_SUFFIXES, expect_known, find_holes, read_depth_file
 from dsr.io.reading import parse_unit
 from dsr.methods.base import Abilities, Cost, Method
 from dsr.sample import FARTHEST, NEAREST, DepthSample
@@ -53,7 +52,7 @@ class External(Method):
         range_type: what the values measure; ``disparity`` in pixels of the photo's camera.
         unit: m, cm, mm or metres per value (of disparities and inverse depths: pixels or 1/m per value). None for 1 of
             floats; whole numbers need one.
-        hole_value: a value that marks a hole, beside those of :func:`dsr.io.encoding.find_holes`.
+        hole_value: a value that marks a hole, beside those of :func:`dsr.io.depth_files.find_holes`.
         fit: to the low-resolution map, in the values' quantity: ``scale``, ``affine`` (scale and shift), None for maps
             that are metric.
         resize: how a map of another size is brought to the photo's; None to refuse it.

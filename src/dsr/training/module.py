@@ -28,9 +28,9 @@ from dsr.sample import Unit
 from dsr.training.callbacks import Curves, log_picture
 from dsr.training.degradation import Batch
 from dsr.training.objective import Objective, to_depth
+from dsr.utils.arrays import read_torch_file
 from dsr.utils.configuration import load_object
 from dsr.utils.guards import refusing
-from dsr.utils.torch_files import read_torch_file
 
 ADAMW = functools.partial(torch.optim.AdamW, lr=1e-3, weight_decay=1e-4)
 _RENDERED_SCENES = 4  # number of scenes of each validation set that are rendered for TensorBoard

@@ -21,8 +21,8 @@ from lightning.pytorch.utilities.seed import isolate_rng
 from torch import Tensor
 
 from dsr.utils import interruption
+from dsr.utils.arrays import read_torch_file
 from dsr.utils.files import replacing
-from dsr.utils.torch_files import read_torch_file
 
 _EVERY = 100  # steps between two looks at the numbers of a training, each of which waits for the device
 _NORM, _SCORE = "train/gradient_norm", "val/RMSE_d"

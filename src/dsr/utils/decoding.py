@@ -41,12 +41,7 @@ def decode_pixels(place: str | Path, content: bytes, flags: int, most: int | Non
     """Return the pixels of an encoded picture as OpenCV decodes them; None if it is damaged or none.
 
     With IMREAD_UNCHANGED, holes of a TIFF of GDAL are 0 or NaN, and grey with opacity has one channel if it is opaque.
-
-    Args:
-        place: its name, for messages.
-        content: a PNG, JPEG, TIFF, BMP, WebP or portable map.
-        most: largest number of pixels; None for what its length explains.
-
+    A message begins with ``place``. ``most``: largest number of pixels; None for what the length explains.
     """
     size = picture_size(io.BytesIO(content))
     if size is None:
@@ -95,10 +90,7 @@ def _only_page(place: str | Path, content: bytes, flags: int) -> tuple[bytes, fl
 
 
 class _QuietStderr:
-    """A context in which stderr is discarded, so that messages of decoders (libpng, OpenCV) are not shown.
-
-    Threads may be in it at the same time: the first redirects stderr and the last restores it.
-    """
+    """A context without messages of decoders: its first thread redirects stderr, and its last one restores it."""
 
     def __init__(self) -> None:
         self._lock, self._within, self._kept = threading.Lock(), 0, -1
@@ -120,7 +112,6 @@ class _QuietStderr:
 
 
 QUIET_DECODERS = _QuietStderr()
-"""A context in which messages of decoders about damaged files are not shown."""
 
 
 def picture_size(file: IO[bytes]) -> tuple[int, int] | None:
@@ -143,14 +134,11 @@ def picture_size(file: IO[bytes]) -> tuple[int, int] | None:
 
 
 class TiffPage(NamedTuple):
-    """A page of a TIFF: the places of its directory and of its orientation (0 for none) in the file, and its tags.
+    """A page of a TIFF."""
 
-    Of a tag that is there twice, the larger values count; texts are their bytes.
-    """
-
-    at: int
-    orientation_at: int
-    tags: dict[int, tuple[int, ...]]
+    at: int  # place of its directory in the file
+    orientation_at: int  # place of its orientation, 0 for none
+    tags: dict[int, tuple[int, ...]]  # the larger values of one that is there twice; texts are their bytes
 
 
 def tiff_pages(file: IO[bytes]) -> list[TiffPage]:
@@ -189,18 +177,12 @@ def tiff_pages(file: IO[bytes]) -> list[TiffPage]:
     return [page for page in pages if not page.tags.get(254, (0,))[0] & ~2 and page.tags.get(255) != (2,)] or pages
 
 
-_NOT_READ = {
-    b"#?": "Radiance HDR", b"v/1\x01": "OpenEXR", b"\x93NUMPY": "a NumPy array", b"PK\3\4": "an archive", b"PF": "PFM",
-    b"GIF8": "GIF", b"8BPS": "Photoshop", b"%PDF": "PDF", b"P7": "PAM", b"Pf": "PFM", b"\xff\x0a": "JPEG XL",
-    b"\0\0\0\x0cJXL ": "JPEG XL", b"\0\0\0\x0cjP  ": "JPEG 2000", b"\xff\x4f\xff\x51": "JPEG 2000",
-    b"FUJIFILM": "a raw photo", b"IIU\0": "a raw photo",
-}  # fmt: skip
 _BRANDS = {b"avi": "AVIF", b"hei": "HEIC", b"hev": "HEIC", b"mif": "HEIC", b"crx": "a raw photo"}
 _COMPRESSIONS = {1, 5, 6, 7, 8, 32773, 32946}  # of TIFF, which OpenCV reads
 
 
 def format_not_read(content: bytes, *, stored: bool) -> str:
-    """Return what a picture is that OpenCV cannot decode, in 8 bits or as ``stored``; empty if damaged or unknown."""
+    """Return what a HEIC or TIFF file is that OpenCV cannot decode, in 8 bits or as ``stored``; empty for others."""
     if content[4:8] == b"ftyp":
         return _BRANDS.get(content[8:11], "a video")
     if content[:2] in (b"II", b"MM") and picture_size(io.BytesIO(content)) is not None:
@@ -210,4 +192,4 @@ def format_not_read(content: bytes, *, stored: bool) -> str:
             return f"a TIFF with compression {compression}"
         if (bits > 16 and not stored) or (bits < 32 and floats):
             return f"a TIFF of {bits}-bit {'floats' if floats else 'values'}"
-    return next((name for magic, name in _NOT_READ.items() if content.startswith(magic)), "")
+    return ""

@@ -31,7 +31,6 @@ MOST_FACES, MOST_POINTS = 25_000_000, 20_000_000  # triangles and points that ar
 _PIXELS, _PIXELS_PER_BYTE = 1 << 25, 64  # that any file may have, and that each byte of a larger one explains (JPEG 20)
 _UNPACKED, _RATIO = 1 << 28, 16  # bytes that any archive of arrays may unpack to, and that each byte of it explains
 _PER_PHOTO, _FLOOR = 4, 1 << 22  # pixels of a map for each of its photo's, and pixels that any photo explains
-_CHUNK = 1 << 20
 _TOO_LITTLE = "not enough memory; a smaller size, scale or batch, or fewer workers need less"
 _NO_LIMIT = 1 << 40  # bytes of memory assumed where the system does not report them
 _MOST_NEEDED = 1e300  # bytes that a message can still name
@@ -40,8 +39,8 @@ _MOST_DIGITS = 300  # of a whole number that a float can still hold
 _LONGEST = 100  # characters of a name that a message shows
 _TURNS = re.compile("([0-9]+|/)")
 _WITH_COMMA = re.compile(r"[-+]?(\d+(,\d+)?(e[-+]?\d+)?|nan|inf)", re.ASCII | re.IGNORECASE)
-# Texts and numbers of a name in turns, numbers as their number of digits and the digits, ``/`` as -1; and the name.
-NaturalKey = tuple[tuple[str | tuple[int, str], ...], str]
+# Limits of a container's memory (cgroup version 2 and 1), of which there are none on a machine as such.
+_CONTAINER = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 _Record = TypeVar("_Record")
 
 
@@ -126,20 +125,16 @@ def files_in(packed: zipfile.ZipFile, archive: object) -> list[zipfile.ZipInfo]:
 
 
 def read_member(packed: zipfile.ZipFile, name: str) -> bytes:
-    """Return a member of an archive, in no more memory than the size that the archive declares for it.
+    """Return a member of an archive, in no more memory than the size that it declares, which the caller checks.
 
-    The caller checks that size. A member that unpacks to more, which :meth:`zipfile.ZipFile.read` would unpack whole
-    before it cuts it off, is damaged.
+    A member that unpacks to more, of which :meth:`zipfile.ZipFile.read` would unpack all, is damaged.
     """
     declared = packed.getinfo(name).file_size
-    parts, length = [], 0
     with packed.open(name) as member:
-        while part := member.read(_CHUNK):
-            parts.append(part)
-            length += len(part)
-    if length != declared:
-        raise zipfile.BadZipFile(f"{name}: {length} bytes instead of {declared}")
-    return b"".join(parts)
+        content = member.read(declared)
+    if len(content) != declared:
+        raise zipfile.BadZipFile(f"{name}: {len(content)} bytes instead of {declared}")
+    return content
 
 
 class OutOfMemoryError(ValueError):
@@ -173,12 +168,15 @@ def expect_memory(name: str, value: object, needed: float) -> None:
 
 
 def _meminfo(name: str) -> int:
-    """Return an entry of Linux's ``/proc/meminfo``, in bytes."""
-    try:
+    """Return an entry of Linux's ``/proc/meminfo`` in bytes, or the limit of this container's memory if it is less."""
+    sizes = [_NO_LIMIT]
+    with contextlib.suppress(OSError, ValueError, StopIteration):
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(name))
-    except (OSError, ValueError, StopIteration):
-        return _NO_LIMIT
+        sizes.append(1024 * next(int(line.split()[1]) for line in lines if line.startswith(name)))
+    for path in _CONTAINER:
+        with contextlib.suppress(OSError, ValueError):  # without a limit the text is "max"
+            sizes.append(int(Path(path).read_text(encoding="ascii")))
+    return min(sizes)
 
 
 @contextlib.contextmanager
@@ -312,8 +310,11 @@ def path_within(folder: Path, name: str, source: object, form: str = "{}") -> Pa
     return path
 
 
-def natural_key(name: str | PurePath) -> NaturalKey:
-    """Return a key that sorts names, or paths folder by folder, with the numbers in them by value: 2 before 10."""
+def natural_key(name: str | PurePath) -> tuple[tuple[str | tuple[int, str], ...], str]:
+    """Return a key that sorts names, or paths folder by folder, with the numbers in them by value: 2 before 10.
+
+    It has texts and numbers in turns, numbers as how many digits they have and the digits, ``/`` as -1; and the name.
+    """
     text = str(name).replace(os.sep, "/")
     parts: list[str | tuple[int, str]] = list(_TURNS.split(text))
     for place in range(1, len(parts), 2):

@@ -16,7 +16,7 @@ from dsr.geometry.plausible import expect_possible
 from dsr.geometry.poses import as_rigid
 from dsr.inference.any_ratio import expect_picture
 from dsr.io.cameras import doubt_camera, doubt_depth
-from dsr.io.encoding import Encoding, decode, far_marks, find_holes, turn_back_bits
+from dsr.io.depth_files import Encoding, decode, far_marks, find_holes, turn_back_bits
 from dsr.io.files import metres_in
 from dsr.io.images import used_bits
 from dsr.io.inputs import Picture

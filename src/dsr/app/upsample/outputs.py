@@ -22,8 +22,7 @@ from dsr.app.upsample.stored import INFO, read_depth, read_errors, read_info
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import ERROR_SHARE, FLATNESS
 from dsr.inference import Plan
-from dsr.io.depth_files import storable, write_depth_file
-from dsr.io.encoding import IN_METRES, Encoding, encode
+from dsr.io.depth_files import IN_METRES, Encoding, encode, storable, write_depth_file
 from dsr.io.exports import (
     FLAT,
     INPUT,
@@ -36,8 +35,7 @@ from dsr.io.exports import (
     write_renderings,
 )
 from dsr.io.inputs import Picture
-from dsr.io.open3d import write_rgbd
-from dsr.io.scene_files import RGBD
+from dsr.io.scene_files import RGBD, write_rgbd
 from dsr.methods.base import Surface
 from dsr.notes import CHECKS, Assumption
 from dsr.utils.files import expect_targets, replacing, write_text
@@ -62,7 +60,7 @@ class Result:
     def encoding(self) -> Encoding:
         """How the result is stored: as the input in the input's format, else in metres, or in whole millimetres.
 
-        It is :data:`dsr.io.encoding.IN_METRES` itself where the input's values are such and no format is chosen. Of
+        It is :data:`dsr.io.depth_files.IN_METRES` itself where the input's values are such and no format is chosen. Of
         whole numbers of 64 bits, which a TIFF may have and no writer writes, it has 32.
         """
         encoding, chosen = self.picture.encoding, self.wanted.format

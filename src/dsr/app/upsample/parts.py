@@ -17,7 +17,7 @@ _SUFFIXES = ("png", "tiff", "npy", "npz", "pfm", "exr")
 # of the depth: suffixes, of which png means whole millimetres where the input is something else; ``mm`` always is a PNG
 # of 16 bits in whole millimetres, 0 in holes
 FORMATS = (*_SUFFIXES, "mm")
-METRES = "depth_metres.tiff"  # depth to the bit, stored as :data:`dsr.io.encoding.IN_METRES` says
+METRES = "depth_metres.tiff"  # depth to the bit, stored as :data:`dsr.io.depth_files.IN_METRES` says
 ERRORS = "confidence.npz"
 
 

@@ -19,8 +19,15 @@ from dsr.inference import find_filled
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import INPUT, read_input
 from dsr.io.frames import UPS
-from dsr.io.open3d import write_open3d
-from dsr.io.scene_files import RGBD, Frame, parse_pose, write_rerun, write_splatting, write_transforms
+from dsr.io.scene_files import (
+    RGBD,
+    Frame,
+    parse_pose,
+    write_open3d,
+    write_rerun,
+    write_splatting,
+    write_transforms,
+)
 from dsr.notes import Assumption, read_warning
 from dsr.sample import expect_distances
 from dsr.utils.arrays import array_headers

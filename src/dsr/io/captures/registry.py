@@ -25,7 +25,7 @@ from dsr.io.captures.zed import ZED
 from dsr.io.pairs import PairingResult
 from dsr.utils.guards import refusing
 
-# Layouts of loose pictures, which dsr.io.layouts and dsr.io.open3d recognise.
+# Layouts of loose pictures, which dsr.io.layouts and dsr.io.trajectories recognise.
 _OPEN3D = Capture(
     "Open3D",
     "a folder of its reconstruction system",

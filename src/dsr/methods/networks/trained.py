@@ -25,9 +25,9 @@ from dsr.methods.networks.network import DisparityNetwork, NetworkUpsampler, Pre
 from dsr.methods.networks.pdn import PrimalDualNetwork
 from dsr.methods.networks.sparse_to_dense import SparseToDense
 from dsr.methods.networks.weight_files import is_dsr_weights, load_network, load_parameters
+from dsr.utils.arrays import read_tensors
 from dsr.utils.guards import MOST_FILE, read_limited, refusing
 from dsr.utils.ratios import SCALES
-from dsr.utils.torch_files import read_tensors
 
 _KINDS: tuple[type[DisparityNetwork], ...] = (
     MSGNet, Facets, FacetsUNet, PrimalDualNetwork, DynamicGuidance, SparseToDense, DDRNet,

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from dsr.methods.base import Cost
 from dsr.methods.images import LUMA, resize_bicubic
 from dsr.methods.networks.weight_files import load_parameters
-from dsr.utils import torch_files
+from dsr.utils import arrays
 
 SWAPPED_LUMA = LUMA[::-1]  # weights of red, green and blue, as some authors' code applies the luma's to RGB
 _NORM_PARTS = ("weight", "bias", "running_mean", "running_var")
@@ -30,7 +30,7 @@ def load_peer(path: Path, network: type[PeerNetwork], scale: float) -> PeerNetwo
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
     """Read the tensors of an authors' file by name, without the prefix of networks trained on several GPUs."""
-    return {name.removeprefix("module."): value for name, value in torch_files.read_tensors(path).items()}
+    return {name.removeprefix("module."): value for name, value in arrays.read_tensors(path).items()}
 
 
 def fold_batch_norm(tensors: dict[str, Tensor], conv: str, norm: str, eps: float = 1e-5) -> None:
