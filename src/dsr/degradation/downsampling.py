@@ -1,14 +1,14 @@
 """Downsampling models: how a high-resolution depth map becomes a low-resolution one.
 
-Every model is a separable kernel, applied as two small matrices. It is batched and differentiable, and averages valid
-pixels only. Kernels for the factor f, in high-resolution pixels from the centre of the low-resolution pixel:
+Every model is a separable kernel, and averages valid pixels only. Kernels for the factor f, in high-resolution pixels
+from the centre of the low-resolution pixel:
 
 - ``box``: the mean of the f x f block.
 - ``nearest``: the block's pixel [f // 2, f // 2], as in ``depth[f // 2 :: f, f // 2 :: f]``.
 - ``bilinear``, ``bicubic`` (a = -0.5): antialiased, their kernels stretched by f, as Pillow resizes.
 - ``gaussian``: standard deviation ``sigma`` * f, truncated at three standard deviations.
 
-At the border, kernels are truncated and normalised. Hints are what a network may be given of a low-resolution map.
+At the border, kernels are truncated and normalised.
 """
 
 from __future__ import annotations
@@ -57,7 +57,6 @@ class Downsampling:
     assumed: Kernel | None = None
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for name, kernel in (("kernel", self.kernel), ("assumed", self.assumed or self.kernel)):
             expect_one_of(name, kernel, KERNELS)
         if not self.sigma >= _LEAST_SIGMA:

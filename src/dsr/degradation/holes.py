@@ -34,7 +34,6 @@ class Blobs:
     size: float = 12.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not 0 < self.share < 1:
             raise ValueError(f"share: expected a number above 0 and below 1, got {self.share}")
         if not self.size >= 1:
@@ -67,7 +66,6 @@ class Shadows:
     baseline: float = 0.2
 
     def __post_init__(self) -> None:
-        """Check the value."""
         if not 0 < abs(self.baseline) < float("inf"):
             raise ValueError(f"baseline: expected metres other than 0, got {self.baseline}")
 

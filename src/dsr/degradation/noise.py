@@ -48,7 +48,6 @@ class GaussianMultiplicative:
     std: float
 
     def __post_init__(self) -> None:
-        """Check the value."""
         if not 0 < self.std < 1:
             raise ValueError(f"std: expected a number above 0 and below 1, got {self.std}")
 
@@ -84,7 +83,6 @@ class TimeOfFlight:
     doffs: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         _expect_positive(strength=self.strength, stereo_constant=self.stereo_constant)
         if not 0 <= self.doffs < math.inf:
             raise ValueError(f"doffs: expected 0 or a positive number, got {self.doffs}")
@@ -129,7 +127,6 @@ class Kinect:
     farthest: float | None = 8.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not 0 <= self.std < math.inf:
             raise ValueError(f"std: expected 0 or a positive number of pixels, got {self.std}")
         limits = {name: getattr(self, name) for name in ("nearest", "farthest") if getattr(self, name) is not None}
@@ -358,16 +355,13 @@ def _stereo(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
     """Two cameras of a size of their own, whose map is enlarged to this one by repeating values."""
     length = _longest(values) ** math.sqrt(uniform(0, 1, generator))  # of the waves, in pixels of this map
     ratio = uniform(1, max(1.0, min(3.4, length / 2)), generator) if chance(0.7, generator) else 1.0
-    rows, columns = (_repeated(size, ratio, generator) for size in values.shape[-2:])
-    seen, shades = (each[:, rows[1]][..., columns[1]] for each in (values, luma))
-    return _match(seen, shades, length / ratio, generator)[:, rows[0]][..., columns[0]]
-
-
-def _repeated(size: int, ratio: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Return which of the sensor's pixels each of a map's repeats, and which of the map's each of the sensor's sees."""
-    shown = ((torch.arange(size) + uniform(0, 1, generator) * (ratio > 1)) / ratio).long()
-    count = int(shown[-1]) + 1
-    return shown, ((torch.arange(count) + 0.5) * (size / count)).long().clamp(max=size - 1)
+    repeats, sees = [], []  # which of the sensor's pixels each of the map's repeats, and which of the map's those see
+    for size in values.shape[-2:]:
+        repeats.append(((torch.arange(size) + uniform(0, 1, generator) * (ratio > 1)) / ratio).long())
+        count = int(repeats[-1][-1]) + 1
+        sees.append(((torch.arange(count) + 0.5) * (size / count)).long().clamp(max=size - 1))
+    seen, shades = (each[:, sees[0]][..., sees[1]] for each in (values, luma))
+    return _match(seen, shades, length / ratio, generator)[:, repeats[0]][..., repeats[1]]
 
 
 def _match(values: Tensor, luma: Tensor, length: float, generator: torch.Generator) -> Tensor:

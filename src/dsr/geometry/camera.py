@@ -61,7 +61,6 @@ class Camera:
     doffs: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check every field, take the absolute value of ``fy``, and make NumPy's numbers Python's."""
         for name in ("width", "height"):
             value = getattr(self, name)
             if not is_number(value) or not float(value).is_integer() or value < 1:
@@ -133,8 +132,7 @@ class Camera:
     def rescale(self, width: int, height: int) -> Camera:
         """Return the camera of the same view, resampled to ``width x height`` pixels that cover the same area.
 
-        The image's outer edge (half a pixel beyond the first pixel centre) stays where it is, as for box downsampling:
-        fx' = fx * s, cx' = (cx + 0.5) * s - 0.5 with s = width / self.width; disparities, in pixels, scale by s too.
+        The image's outer edge (half a pixel beyond the first pixel centre) stays where it is, as for box downsampling.
         """
         sx, sy = width / self.width, height / self.height
         return replace(

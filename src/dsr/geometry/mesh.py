@@ -1,13 +1,11 @@
 """Triangle meshes of depth maps, cut at depth steps, and fewer triangles and points for those beyond a limit.
 
-The inverse depth of a plane is linear in the pixel at any viewing angle. So neighbouring pixels lie on different sides
-of a step if inverse depth changes by more than the slopes on both sides predict, over windows of up to five pairs of
-pixels where interpolation has spread the step. With a tolerance, flat parts get large triangles of a hierarchy (Evans,
-Kirkpatrick and Townsend, *Right-Triangulated Irregular Networks*, Algorithmica 2001): a triangle is halved as long as
-leaving out the middle of its longest side changes the inverse depth there by too much, and the pixels of a smaller
-triangle count for the larger ones that hold it, so that neighbours share whole sides. Meshes are simplified by quadric
-edge collapses (Garland and Heckbert, SIGGRAPH 1997) of the library `fast-simplification` (the extra ``mesh``); without
-it, rows and columns are left out.
+Neighbouring pixels lie on different sides of a step if inverse depth, which is linear on a plane, changes by more than
+the slopes on both sides predict, over windows of up to five pairs of pixels. With a tolerance, flat parts get large
+triangles of a hierarchy (Evans, Kirkpatrick and Townsend, *Right-Triangulated Irregular Networks*, Algorithmica 2001):
+a triangle is halved as long as leaving out the middle of its longest side changes the inverse depth there by too much.
+Meshes are simplified by quadric edge collapses (Garland and Heckbert, SIGGRAPH 1997) of the library
+`fast-simplification` (the extra ``mesh``); without it, rows and columns are left out.
 """
 
 from __future__ import annotations
@@ -51,12 +49,9 @@ def triangulate(
 ) -> Mesh:
     """Join neighbouring valid pixels by triangles, two per square of four pixels, except across steps in depth.
 
-    The diagonal of a square is the one with the smaller change of depth. A square with one missing pixel gives one
-    triangle. Memory: about 110 bytes per pixel, and 80 bytes for :func:`vertex_normals`.
-
-    Depth is (1, H, W) in metres, NaN in holes. ``isolated`` keeps vertices without a triangle. ``tolerance``,
-    (1, H, W), is the largest deviation of most pixels from the mesh in metres (a few deviate by about twice as much),
-    so that flat parts get large triangles; None for a mesh of all pixels.
+    The diagonal of a square is the one with the smaller change of depth. Depth is (1, H, W) in metres, NaN in holes.
+    ``isolated`` keeps vertices without a triangle. ``tolerance``, (1, H, W), is the largest deviation of most pixels
+    from the mesh in metres, so that flat parts get large triangles; None for a mesh of all pixels.
     """
     if tuple(depth.shape) != (1, camera.height, camera.width):
         raise ValueError(f"depth: expected shape {(1, camera.height, camera.width)}, got {tuple(depth.shape)}")

@@ -1,10 +1,9 @@
 """Poses of cameras: rigid transforms, and whether those of frames fit their depth maps.
 
 A pose is the transform from a camera's frame (x right, y down, z forward) to the world's, a 4 x 4 matrix in metres.
-:func:`check_poses` moves the points of one depth map into the view of another: where they see the same surfaces, the
-depths agree. That is measured under the poses as given, under each of :data:`READINGS`, other conventions and units,
-and without any motion, which shows how informative the frames are: before a wall, or of a camera that stands still, all
-readings agree.
+:func:`check_poses` moves the points of one depth map into the view of another, where depths should agree: under the
+poses as given, under each of :data:`READINGS`, other conventions and units, and without any motion, which shows how
+informative the frames are.
 """
 
 from __future__ import annotations

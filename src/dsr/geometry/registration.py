@@ -1,10 +1,9 @@
 """The displacement of a depth map against its photo: a shift and a change of scale, found from edges, and undone.
 
-At each jump of depth between two neighbouring pixels, the photo's gradient in the same direction is read. If photo and
-depth belong together, the mean gradient has a distinct maximum at one shift. A search over whole pixels and steps of
-scale, by Fourier transforms, is refined to fractions of a pixel. A displacement counts only if the gain is significant,
-which is estimated from tiles of the image, because the pixels of a contour are correlated; a change of scale only if it
-gains beyond the best shift.
+At each jump of depth between two neighbouring pixels, the photo's gradient in the same direction is read. The mean
+gradient has a distinct maximum at one shift. A search over whole pixels and steps of scale, by Fourier transforms, is
+refined to fractions of a pixel. A displacement counts only if the gain is significant, which is estimated from tiles of
+the image; a change of scale only if it gains beyond the best shift.
 """
 
 from __future__ import annotations
@@ -60,7 +59,6 @@ class Displacement:
     moved: float = 0.0  # of a corner, in pixels of the photo, at most ``WORKING_SIZE`` on its longer side
 
     def __str__(self) -> str:
-        """Return the displacement of depth that is undone, for people."""
         across = f"{abs(self.right):.1f} px to the {'right' if self.right > 0 else 'left'}"
         down = f"{abs(self.down):.1f} px {'down' if self.down > 0 else 'up'}"
         return f"{across}, {down}" + (f", scale {self.scale:.4f}" if self.scale != 1 else "")
@@ -130,8 +128,10 @@ def find_displacement(depth_lr: Tensor, rgb: Tensor) -> Displacement | None:
     if len(tiles) < _LEAST_EDGES or int(tiles.max()) + 1 < _LEAST_TILES:
         return None
     photo = functional.interpolate(rgb[None].float().cpu(), size, mode="bilinear", antialias=True)[0]
-    gradients = _edge_gradients(photo.double().numpy())
-    comparison = _Comparison(Edges(right, below), tiles, gradients, size, factor, radius)
+    blurred = ndimage.gaussian_filter(photo.double().numpy(), (0, 0.7, 0.7))
+    largest = np.abs(np.diff(blurred, axis=2)).max(axis=0), np.abs(np.diff(blurred, axis=1)).max(axis=0)  # of channels
+    local = [np.minimum(each / (ndimage.uniform_filter(each, 31) + 0.01), 4) for each in largest]
+    comparison = _Comparison(Edges(right, below), tiles, (local[0], local[1]), size, factor, radius)
     down, across, scale = best = _search(comparison)
     sums = comparison.sums(*best)
     for simpler in ((0.0, 0.0, 1.0), (0.0, across, scale), (down, 0.0, scale)):
@@ -206,14 +206,6 @@ def _jumps(depth: Array, safe: NDArray[np.bool_], gap: int) -> Array:
     place = np.where(depth[rows, before] < depth[rows, after + 1], before, after)
     kept = safe[rows, before] & safe[rows, after + 1]
     return np.stack((rows[kept], place[kept])).astype(np.float64)
-
-
-def _edge_gradients(photo: Array) -> Gradients:
-    """Return the largest gradients of the channels of a photo, (3, H, W), relative to their local mean, up to 4."""
-    blurred = ndimage.gaussian_filter(photo, (0, 0.7, 0.7))
-    right, below = np.abs(np.diff(blurred, axis=2)).max(axis=0), np.abs(np.diff(blurred, axis=1)).max(axis=0)
-    ratios = [np.minimum(gradient / (ndimage.uniform_filter(gradient, 31) + 0.01), 4) for gradient in (right, below)]
-    return ratios[0], ratios[1]
 
 
 def _mean_gradients(each: Iterable[Edges], gradients: Gradients, radius: int) -> Iterator[Array]:

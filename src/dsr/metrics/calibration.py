@@ -3,11 +3,9 @@
 These functions take expected and measured absolute errors of the same pixels, of any shape, and return float64. Pixels
 without either error, NaN, are left out; without any pixel the result is NaN.
 
-ENCE is that of Levi et al., *Evaluating and Calibrating Uncertainty Prediction in Regression Tasks*, Sensors 2022, with
-parts of equal numbers of pixels, while ``ENCE.py`` of EFS-OpenSource/calibration-framework (cc19d1b) has bins of equal
-width. AUSE is that of Ilg et al., *Uncertainty Estimates and Multi-Hypotheses Networks for Optical Flow*, ECCV 2018,
-with the subsets of ``compute_aucs`` in ``evaluate.py`` of mattpoggi/mono-uncertainty (543772b), which has 50 steps,
-does not divide by the mean error, and keeps all pixels of equal expected error or none.
+ENCE is that of Levi et al., Sensors 2022, with parts of equal numbers of pixels, not of equal width. AUSE is that of
+Ilg et al., ECCV 2018, with the subsets of mattpoggi/mono-uncertainty (543772b), which has 50 steps and does not divide
+by the mean error.
 """
 
 from __future__ import annotations
@@ -41,8 +39,7 @@ def measured_errors(prediction: Tensor, target: Tensor, rays: Tensor) -> tuple[T
 def error_ratios(expected: Tensor, measured: Tensor, parts: int = 10) -> Tensor:
     """Return the mean measured error over the mean expected error for equal parts of the pixels, (parts,).
 
-    The pixels are sorted by expected error, those of equal expected error as they come. More than 1 means larger errors
-    than expected. NaN for a part without pixels, infinite for one whose expected errors are all 0.
+    The pixels are sorted by expected error. NaN for a part without pixels, infinite where expected errors are all 0.
     """
     expected, measured = _ordered(expected, measured)
     pairs = zip(expected.tensor_split(parts), measured.tensor_split(parts), strict=True)
@@ -52,8 +49,7 @@ def error_ratios(expected: Tensor, measured: Tensor, parts: int = 10) -> Tensor:
 def squared_error_share(expected: Tensor, measured: Tensor, kept: float = 0.8) -> Tensor:
     """Return the fraction of the sum of squared errors that lies in the pixels with the smallest expected errors, ().
 
-    Expected errors that have nothing to do with the measured ones give ``kept``, the fraction of pixels, on average;
-    the least possible value is that of ``squared_error_share(measured, measured)``.
+    Unrelated expected errors give ``kept``, the fraction of pixels, on average.
     """
     _, measured = _ordered(expected, measured)
     squares = measured.square()
@@ -91,8 +87,7 @@ def sparsification(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Te
 def ause(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Tensor:
     """Return the area under the sparsification error, relative to the mean error; it depends on the number of steps.
 
-    The sparsification error is the curve of :func:`sparsification` less that of an oracle, which expects the measured
-    errors.
+    It is the curve of :func:`sparsification` less that of an oracle, which expects the measured errors.
     """
     measured = measured.masked_fill(~expected.isfinite(), torch.nan)
     curve, oracle = sparsification(expected, measured, steps), sparsification(measured, measured, steps)

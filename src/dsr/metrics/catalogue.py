@@ -17,17 +17,7 @@ from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, MIN_SIZE, lpips_v
 from dsr.sample import CENTIMETRES, Unit
 
-__all__ = [
-    "KNOWN_FORMATS",
-    "METRICS",
-    "PROTOCOLS",
-    "Metric",
-    "Score",
-    "catalogue",
-    "depth_mask",
-    "normal_mask",
-    "score_image",
-]
+__all__ = ["KNOWN_FORMATS", "PROTOCOLS", "Metric", "Score", "catalogue", "depth_mask", "normal_mask", "score_image"]
 
 
 def _bad_pixels(percent: int, unit: str, shown: str, position: int | None = None) -> Metric:
@@ -128,9 +118,6 @@ def score_image(
 ) -> Iterator[Score]:
     """Score one predicted depth map; NaN where no pixel can be scored.
 
-    Rows and columns at the border without any predicted pixel are cut off first (MSG's published networks leave out the
-    last of each), except for metrics of the whole image. The valid fractions still refer to the complete map.
-
     Both maps are (1, H, W) orthogonal depth in metres, NaN where missing, the rays (3, H, W), regions (1, H, W) uint8,
     and ``errors`` the method's expected errors, (1, H, W): of depth in metres, of normals in degrees. Metrics for other
     units, absent regions or absent errors are left out.
@@ -143,6 +130,8 @@ def score_image(
         stated = {"depth_error": errors[0][at], "angle_error": errors[1][at]} if errors else {}
         return SurfacePair(*parts, unit=unit, regions=inside, image_dtype=torch.float32, **stated)
 
+    # Rows and columns at the border without any predicted pixel, which MSG's published networks leave out, are cut off,
+    # except for metrics of the whole image; the valid fractions still refer to the complete map.
     whole = inner = pair_of()
     valid = prediction.isfinite()[0]
     if valid.any():

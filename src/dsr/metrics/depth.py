@@ -6,20 +6,13 @@
 - ``metrics=field``: RMSE and MAE of depth super-resolution in centimetres (NYU, RGB-D-D) or in 8-bit levels
   (Middlebury, Lu), and the fractions of pixels off by more than 5 cm or by a ratio of more than 1.25.
 - ``metrics=normals``: mean, median and fractions below five angles of Bae and Davison, CVPR 2024 (baegwangbin/DSINE
-  ef0c2af). Both normal maps are forward differences of depth; central differences have smaller angles for a noisy map,
-  by a fifth and more.
-- ``metrics=points``: the pixels with both depths and all pixels with a true depth as two clouds, P = z r in metres,
-  not thinned out. *Chamfer distance*: the mean of the mean distances of either cloud to the other (``chamfer_dist`` in
-  ``unidepth/utils/evaluation_depth.py`` of lpiccinelli-eth/UniDepth 8d8cfe4). *F-score*: the harmonic mean of precision
-  and recall, the fractions of the two clouds that are less than a threshold from the other one (Knapitsch et al.,
-  *Tanks and Temples*, SIGGRAPH 2017; ``eval_mesh`` in ``atlas/evaluation.py`` of magicleap/Atlas bee3ddb takes 5 cm, as
-  for ScanNet, and thins both clouds out to 2 cm first). *Flying pixels*: predicted points in the void between two
-  surfaces (Sabov and Krueger, SCCG 2008). A point flies if it lies between the front and the back of true depth
-  discontinuities within 16 pixels along rows and columns, as far as one low-resolution pixel reaches at x16, and more
-  than 1 % of its depth away from every true point.
+  ef0c2af). Both normal maps are forward differences of depth; central differences have smaller angles.
+- ``metrics=points``: the pixels with both depths and all pixels with a true depth as two clouds, not thinned out.
+  *Chamfer distance* as ``chamfer_dist`` of lpiccinelli-eth/UniDepth 8d8cfe4, *F-score* of Knapitsch et al., *Tanks and
+  Temples*, SIGGRAPH 2017. *Flying pixels* (Sabov and Krueger, SCCG 2008) lie between the front and the back of true
+  depth discontinuities within 16 pixels along rows and columns, and more than 1 % of their depth from every true point.
 
-Depth is orthogonal, in metres, neither capped nor cropped. Missing predictions are left out of every mean; the
-fractions ``covered`` stand beside them.
+Depth is neither capped nor cropped. Missing predictions are left out; the fractions ``covered`` stand beside the means.
 """
 
 from __future__ import annotations
@@ -38,7 +31,7 @@ from dsr.metrics.functional import SurfacePair, angle, masked_mean, masked_media
 _DELTAS = {"delta_105": 1.05, "delta_110": 1.1, "delta_125": 1.25, "delta_125_2": 1.25**2, "delta_125_3": 1.25**3}
 _WITHIN = {"within_5": 5, "within_7_5": 7.5, "within_11_25": 11.25, "within_22_5": 22.5, "within_30": 30}  # degrees
 EDGE_RATIO = 1.05  # of the depths of two neighbours at a discontinuity, as in Depth Pro's contours
-EDGE_RADIUS = 16  # pixels
+EDGE_RADIUS = 16  # pixels, as far as a low-resolution pixel reaches at x16
 FLYING = 0.01  # distance of a flying pixel from every true point, as a fraction of its depth
 
 

@@ -1,15 +1,13 @@
 """RelNormal and SAWA-H of EvalMDE, and the parts of SAWA-H singly.
 
 Wu et al., *Toward a Better Understanding of Monocular Depth Evaluation* (arXiv 2510.19814); princeton-vl/EvalMDE
-ea9e21c, ``evalmde/metrics`` and ``evalmde/utils``. SAWA-H is a sum of errors, weighted to agree with human judgment:
+ea9e21c. SAWA-H is a sum of errors, weighted to agree with human judgment:
 
     SAWA-H = 3.65 wkdr + 0.18 beyond_disparity + 0.01 beyond_depth + 0.20 (1 - boundary F1) + 1.94 RelNormal
 
 WKDR is of all pairs of pixels, of which theirs draws 10^7 without a seed; Sobol points are in 64 bits, not 32.
 
-Pixels without a truth are left out. Holes of a prediction count as errors: pi in RelNormal, as theirs do; a pair of
-pixels in the wrong order; beyond the ratio; no edges where the truth has some. Only false edges are spared by holes,
-so ``EvalMDE_covered`` belongs to every score.
+Pixels without a truth are left out. Holes of a prediction count as errors, except for false edges, which they spare.
 """
 
 from __future__ import annotations
@@ -42,9 +40,8 @@ MIN_SIZE = 2 * SCALES[-1] + 1  # of a map with a normal at the coarsest scale
 def rel_normal(pair: SurfacePair) -> Tensor:
     """Return RelNormal, (B,) in radians, the mean error of the angle between two normals; lower is better.
 
-    At each of four scales, 10^6 pairs of pixels up to 32 pixels of scale 1 apart, and the mean of the scales' means. At
-    a coarser scale each block has the depth of the pixel with a truth that is nearest to its centre. A pair counts if
-    the truth has both normals, as an error of pi if the prediction has not.
+    At each of four scales, 10^6 pairs of pixels up to 32 pixels of scale 1 apart, and the mean of the scales' means.
+    A pair counts if the truth has both normals, as an error of pi if the prediction has not.
     """
     shape, found = pair.target.shape, []
     target = torch.where(pair.target_mask, pair.given[1], 1)

@@ -1,10 +1,9 @@
 """Metrics of depth maps of real sensors: against a ground truth that is also measured, and of a board.
 
-- ``metrics=sensor``: neither map is perfect. The sensor has a constant bias, which is not shape, the truth ends at
-  ragged borders, and a few pixels of either belong to another surface. Therefore the scored pixels are those at least
-  four pixels away from unknown truth, and two away from unknown predictions and from those more than 0.1 m off, along
-  rows and columns. The median difference over them is subtracted from the prediction, and normals and renderings are
-  compared as in the paper's metrics, with unknown pixels replaced by the truth's median depth.
+- ``metrics=sensor``: neither map is perfect. The scored pixels are those at least four pixels away from unknown truth,
+  whose borders are ragged, and two away from unknown predictions and from those more than 0.1 m off, along rows and
+  columns. Their median difference, a bias of the sensor, is subtracted, and normals and renderings are compared as in
+  the paper's metrics, with unknown pixels replaced by the truth's median depth.
 - ``metrics=plane``: the plane of a board is the ground truth, known within its outline alone. The median difference is
   subtracted, and pixels more than 60 mm off belong to another surface.
 
@@ -111,8 +110,8 @@ def compare_board(pair: SurfacePair) -> tuple[Tensor, Tensor]:
 def board_errors(pair: SurfacePair) -> dict[str, Tensor]:
     """Return the scores of a board by name, (B,) each.
 
-    ``std`` is the standard deviation of depth about the plane in metres, ``angle`` the mean angle between the normals,
-    by differences over two pixels, and the plane's in degrees, ``covered`` the fraction of pixels of the board.
+    ``std`` is of depth about the plane in metres, ``angle`` the mean angle between its normal and those by differences
+    over two pixels in degrees, ``covered`` the fraction of pixels of the board.
     """
     scored, off = compare_board(pair)
     mean = masked_mean(off, scored)[..., None, None]

@@ -1,11 +1,11 @@
 """Metrics of depth over time: flicker of what stands still, and whether frames of a moving camera agree.
 
 - :func:`flicker`, :func:`temporal_noise` and :func:`normal_flicker` need a camera that stands still. Temporal noise is
-  ``calculate_temporal_noise`` in ``tools/depth-quality/rs-depth-quality.cpp`` of IntelRealSense/librealsense (cacc8e7).
+  that of IntelRealSense/librealsense (cacc8e7, ``rs-depth-quality.cpp``).
 - :func:`opw` needs poses: Wang et al., *Less Is More*, ACM MM 2022, and *Neural Video Depth Stabilizer*, ICCV 2023,
-  with the rigid flow of depth and pose; ``smooth_loss.py`` (d7b66e4) of RaymondWang987/NVDS.
-- :func:`tgm` needs a truth: temporal gradient matching of Chen et al., *Video Depth Anything*, CVPR 2025,
-  ``TemporalGradientMatchingLoss`` in ``loss/loss.py`` of DepthAnything/Video-Depth-Anything (4f5ae23), with one stride.
+  with the rigid flow of depth and pose; RaymondWang987/NVDS (d7b66e4).
+- :func:`tgm` needs a truth: temporal gradient matching of Chen et al., *Video Depth Anything*, CVPR 2025, with one
+  stride; DepthAnything/Video-Depth-Anything (4f5ae23).
 
 All are of one sequence, (), and lower is better. None knows whether the depth is right: a constant has the best of each
 but the last. Holes are left out, and :func:`covered` stands beside them.
@@ -79,9 +79,8 @@ def opw(
 ) -> Tensor:
     """Return the mean difference between the depth of a frame and that of the frame before, warped into its view.
 
-    The frame before is warped with a z-buffer, so that what a surface hides does not count, and what appears is a hole.
-    The authors' code normalises disparity, and its weights of colours from 0 to 255 leave hardly any pixel. Here it is
-    a weighted mean in metres.
+    The frame before is warped with a z-buffer: what a surface hides does not count, and what appears is a hole. Here it
+    is a weighted mean in metres; the authors' code normalises disparity.
 
     Args:
         depths: (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN is a hole.
@@ -123,7 +122,7 @@ def tgm(prediction: Tensor, target: Tensor, static: Tensor | None = None) -> Ten
     """Return the mean difference between the changes of predicted and true depth from frame to frame, () in metres.
 
     Depths are (T, 1, H, W) in metres, NaN in holes. Pixels count whose true depth changes by less than 5 % of the range
-    of the later frame's: it is of one surface. The authors' training takes ten times the value, of fitted disparity.
+    of the later frame's: it is of one surface.
     """
     if prediction.shape != target.shape:
         raise ValueError(f"target: expected shape {tuple(prediction.shape)}, got {tuple(target.shape)}")

@@ -218,7 +218,6 @@ class _PatchLoader(DataLoader[Batch]):
     """A loader whose workers do not end before the training, if all get a signal, as from a cluster or a terminal."""
 
     def __iter__(self) -> Any:  # a type that torch does not export
-        """Start the workers."""
         with interruption.starting_workers(signal.SIGTERM):
             return super().__iter__()
 

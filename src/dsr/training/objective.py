@@ -94,7 +94,6 @@ class DepthObjective(Objective):
     shading: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         expect_one_of("depth_loss", self.depth_loss, _DEPTH_LOSSES)
         if not 0 <= self.shading < math.inf:
             raise ValueError(f"shading: expected 0 or a positive number, got {self.shading}")

@@ -9,14 +9,14 @@ with f a Gaussian of the distance in low-resolution pixels, r = 1 if a 4-connect
 neighbourhood touches no edge and 0 otherwise, and k_p the sum of the weights.
 
 What differs, besides the edge map and what docs/measurements/methods.md says: a low-resolution pixel with an edge
-through it mixes both sides, so its weight is multiplied by ``mixed``. Pixels on edges get the value that makes the mean
-of their block equal to the low-resolution value, starting from the bicubic map and staying between the two sides, which
-places an edge with subpixel accuracy; then each takes the reachable pixels of its most similar neighbour off the edge,
-only in the last stage. In the original they reach both sides. Where no pixel is reachable, the result is the bicubic
-map.
+through it mixes both sides, so its weight is multiplied by ``mixed``. Pixels on edges get the value that preserves the
+mean of their block, between the two sides; in the last stage, each then takes the reachable pixels of its most similar
+neighbour off the edge. Where no pixel is reachable, the result is the bicubic map.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass, field
 
 import torch
 from scipy import ndimage
@@ -70,9 +70,8 @@ def bilateral_filter(
 def find_reachable(barrier: Tensor, scale: int, radius: int) -> Tensor:
     """Return which low-resolution pixels each high-resolution pixel reaches, (2 radius + 1, 2 radius + 1, H, W) bool.
 
-    [radius + a, radius + b] is for the low-resolution pixel a rows below and b columns right of the pixel's own. A path
-    starts in its middle, runs over 4-connected high-resolution pixels off the edges of the barrier, (H, W) bool, and
-    stays within the low-resolution pixels at most ``radius`` rows and columns away.
+    [radius + a, radius + b] is for the one a rows below and b columns right of the pixel's own. Paths start in its
+    middle, and are 4-connected, off the edges of the barrier, (H, W) bool, and within ``radius`` rows and columns.
     """
     height, width = barrier.shape[0] // scale, barrier.shape[1] // scale
     side, edge = 2 * radius + 1, radius * scale
@@ -146,6 +145,7 @@ def _take_sides(reachable: Tensor, barrier: Tensor, hr: Tensor, scale: int) -> N
     reachable[:, :, places[:, 0], places[:, 1]] = seen & within[:, None, :, 0] & within[None, :, :, 1]
 
 
+@dataclass(eq=False)
 class EdgeGuided(Method):
     """Edge-guided upsampling of the low-resolution disparity.
 
@@ -167,59 +167,48 @@ class EdgeGuided(Method):
 
     abilities = Abilities(cost=Cost(1500, 12))
 
-    def __init__(
-        self,
-        step: float = 0.05,
-        candidates: int = 5,
-        sharp_weight: float = 3.0,
-        smoothness: float = 1.0,
-        iterations: int = 100,
-        radius: int = 1,
-        sigma_space: float = 0.5,
-        mixed: float = 0.01,
-        *,
-        fill_holes: bool = False,
-    ) -> None:
-        expect_positive(step=step, candidates=candidates, sharp_weight=sharp_weight, smoothness=smoothness)
-        expect_positive(iterations=iterations, sigma_space=sigma_space, mixed=mixed)
-        expect_window(radius=radius)
-        self._step, self._candidates, self._sharp_weight, self._smoothness = step, candidates, sharp_weight, smoothness
-        self._iterations, self._radius, self._sigma_space, self._mixed = iterations, radius, sigma_space, mixed
-        self._fill_holes = fill_holes
-        self.history: list[dict[str, float]] = []
+    step: float = 0.05
+    candidates: int = 5
+    sharp_weight: float = 3.0
+    smoothness: float = 1.0
+    iterations: int = 100
+    radius: int = 1
+    sigma_space: float = 0.5
+    mixed: float = 0.01
+    fill_holes: bool = field(default=False, kw_only=True)
+
+    def __post_init__(self) -> None:
+        expect_positive(step=self.step, candidates=self.candidates, sharp_weight=self.sharp_weight)
+        expect_positive(smoothness=self.smoothness, iterations=self.iterations)
+        expect_positive(sigma_space=self.sigma_space, mixed=self.mixed)
+        expect_window(radius=self.radius)
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth."""
         disparity = disparity_lr = sample.disparity_lr(torch.float64)[0]
         lowest, highest = (float(bound) for bound in disparity_lr[disparity_lr.isfinite()].aminmax())
-        step = self._step * (highest - lowest)
+        step = self.step * (highest - lowest)
         self.history = []
-        stages = prime_factors(whole_scale(sample))
+        stages, rest = [], whole_scale(sample)  # the prime factors, the smallest first
+        while rest > 1:
+            stages.append(next(n for n in range(2, rest + 1) if rest % n == 0))
+            rest //= stages[-1]
         barrier: Tensor | None = None
         for number, scale in enumerate(stages):
-            report = part_of(progress, number * self._iterations, len(stages) * self._iterations) or ignore
+            report = part_of(progress, number * self.iterations, len(stages) * self.iterations) or ignore
             doubtful, last = barrier, number == len(stages) - 1
             barrier, history = predict_edge_map(
-                disparity, scale, step, self._candidates, self._sharp_weight, self._smoothness, self._iterations, report
+                disparity, scale, step, self.candidates, self.sharp_weight, self.smoothness, self.iterations, report
             )
-            report(self._iterations, self._iterations)
+            report(self.iterations, self.iterations)
             done = self.history[-1]["iteration"] if self.history else 0.0
             self.history += [{**entry, "iteration": entry["iteration"] + done} for entry in history]
             disparity = bilateral_filter(
-                disparity, barrier, scale, self._radius, self._sigma_space, self._mixed, doubtful=doubtful, sharp=last
+                disparity, barrier, scale, self.radius, self.sigma_space, self.mixed, doubtful=doubtful, sharp=last
             )
         doffs = sample.camera.doffs  # disparity + doffs is inverse depth
         disparity = disparity.clamp((lowest + doffs) / BEYOND - doffs, (highest + doffs) * BEYOND - doffs)
-        if self._fill_holes:
+        if self.fill_holes:
             disparity = inpaint(disparity[None, None])[0, 0]
         return from_range(disparity[None], sample.camera, "disparity").to(sample.depth_lr)
-
-
-def prime_factors(scale: int) -> list[int]:
-    """Return the prime factors of a scale, the smallest first; none of 1."""
-    factors = []
-    while scale > 1:
-        factors.append(next(n for n in range(2, scale + 1) if scale % n == 0))
-        scale //= factors[-1]
-    return factors

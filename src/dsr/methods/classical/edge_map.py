@@ -1,17 +1,15 @@
 """The high-resolution edge map of a low-resolution map: recurring patches of edges and a Markov random field.
 
-Xie, Feris, Sun, *Edge-Guided Single Depth Image Super Resolution*, IEEE TIP 25(1), 2016, the self-similar mode, which
-needs no training data. The map itself, downsampled once more, gives pairs of patches: edges found after upsampling, and
-the true ones. The candidates of each patch of edges in the upsampled map are the pairs most similar to it, and a Markov
-random field selects one of them: its data term is the squared distance of the patches' distance transforms plus
-``sharp_weight``^2 times that of the sharp edges, by the number of pixels, and its smoothness term the squared
-difference of the true patches where two patches overlap. The mean of the chosen patches, where it is above ``_KEPT``,
-and thinned to lines, is the edge map. Equal input gives equal labels, on any device.
+Xie, Feris, Sun, *Edge-Guided Single Depth Image Super Resolution*, IEEE TIP 25(1), 2016, the self-similar mode. The map
+itself, downsampled once more, gives pairs of patches: edges found after upsampling, and the true ones. The candidates
+of each patch of edges in the upsampled map are the pairs most similar to it, and a Markov random field selects one of
+them: its data term is the squared distance of the patches' distance transforms plus ``sharp_weight``^2 times that of
+the sharp edges, by the number of pixels, and its smoothness term the squared difference of the true patches where two
+patches overlap. The mean of the chosen patches, where it is above ``_KEPT``, and thinned to lines, is the edge map.
 
-What differs: edges are Canny's edges of the bicubic map, and the surface's slope does not count; the original's shock
-filter does not move the inflection lines, which locate a step of block means within a low-resolution pixel. Pairs are
-used in the 8 orientations of the grid, not rotated by multiples of 18 degrees. Each cell of 2 x 2 pixels has at most
-one patch; the original scans, and skips each patch's neighbours. The map is extrapolated, so edges reach the border.
+What differs: edges are Canny's edges of the bicubic map, and the surface's slope does not count. Pairs are used in the
+8 orientations of the grid, not rotated by multiples of 18 degrees. Each cell of 2 x 2 pixels has at most one patch. The
+map is extrapolated, so edges reach the border.
 """
 
 from __future__ import annotations
@@ -66,7 +64,11 @@ def predict_edge_map(
             f"edge-guided upsampling: the edges of a map of {lr.shape[0]} x {lr.shape[1]} pixels do not recur "
             f"at 1/{scale} of its size, so nothing shows how high-resolution ones look"
         )
-    places = _patch_centres(edges)
+    half = PATCH // 2  # the first edge pixel of each cell whose patch lies inside the map
+    places = edges[half:-half, half:-half].nonzero() + half
+    cells = places[:, 0] // _CELL * edges.shape[1] + places[:, 1] // _CELL
+    first = np.sort(np.unique(cells.cpu().numpy(), return_index=True)[1])
+    places = places[torch.from_numpy(first).to(places.device)]
     distances, indices = find_nearest(extract_patches(edges, places), examples, candidates, sharp_weight)
     patches = examples[:, 1].flatten(1)[indices].float()  # (N, K, PATCH^2)
     pairs, costs = find_overlaps(places, patches)
@@ -83,9 +85,8 @@ def predict_edge_map(
 def detect_edges(lr: Tensor, scale: int, step: float) -> Tensor:
     """Return the edges of a map, (h, w), upsampled by ``scale``, (h * scale, w * scale) bool, about one pixel wide.
 
-    Canny, *A Computational Approach to Edge Detection*, PAMI 1986. A step of height s between low-resolution pixels has
-    a gradient of at least s / 2. A gradient counts only by how much it exceeds the slope of the surface there or at a
-    neighbouring low-resolution pixel, so that neither planes nor inpainted holes have edges.
+    Canny, *A Computational Approach to Edge Detection*, PAMI 1986. A step of height s has a gradient of at least s / 2,
+    which counts only by how much it exceeds the slope of the surface around: planes and inpainted holes have no edges.
     """
     hr = upsample_linear_border(inpaint(lr[None, None]), scale)[0, 0]
     down, across = (_central_difference(hr, axis) * scale for axis in (0, 1))
@@ -156,15 +157,6 @@ def _drop_small(mask: Tensor) -> Tensor:
     size = 2 * _SMALLEST - 1
     number = functional.avg_pool2d(mask[None, None].float(), size, 1, size // 2, divisor_override=1)[0, 0]
     return mask & (number > _SMALLEST - 0.5)
-
-
-def _patch_centres(edges: Tensor) -> Tensor:
-    """Return the first edge pixel of each cell whose patch lies inside the map, (N, 2)."""
-    half = PATCH // 2
-    places = edges[half:-half, half:-half].nonzero() + half
-    cells = places[:, 0] // _CELL * edges.shape[1] + places[:, 1] // _CELL
-    _, first = np.unique(cells.cpu().numpy(), return_index=True)
-    return places[torch.from_numpy(np.sort(first)).to(places.device)]
 
 
 def extract_patches(mask: Tensor, places: Tensor) -> Tensor:
@@ -254,11 +246,10 @@ def label(
     """Return labels, (N,), that have a low :func:`energy`, and the history of min-sum belief propagation.
 
     Pearl, *Probabilistic Reasoning in Intelligent Systems*, 1988. The message from i to j is m_ij(x_j) = min over x_i
-    of unary_i(x_i) + cost_ij(x_i, x_j) + the messages to i from nodes other than j, less its minimum. Messages are
-    damped by one half, because they may oscillate on loops. A node's label minimises unary_i plus all messages to it;
-    the best labels so far are kept. ``unary`` is (N, K), ``costs`` (E, K, K) are those of the labels of the nodes of
-    each pair (E, 2). It stops if no message changes by more than the tolerance, times the largest cost. The history has
-    the ``objective``, the energy, and ``moved``, the largest change of a message, relative to the largest cost.
+    of unary_i(x_i) + cost_ij(x_i, x_j) + the messages to i from nodes other than j, less its minimum, damped by one
+    half. A node's label minimises unary_i plus all messages to it; the best labels so far are kept. ``unary`` is
+    (N, K), ``costs`` (E, K, K) are those of the labels of the nodes of each pair (E, 2). It stops if ``moved``, the
+    largest change of a message relative to the largest cost, is at most the tolerance; ``objective`` is the energy.
     """
     report = progress or ignore
     unit = (float(costs.abs().max()) if len(costs) else 0.0) or 1.0

@@ -4,12 +4,10 @@ Of all piecewise constant albedos, it finds one with a low
 
     E = 1/2 sum (rgb - albedo * shading)^2 + weight * (number of pairs of neighbours in different regions),
 
-the Potts prior of Haefner et al. (CVPR 2018), who minimise it with a primal-dual iteration. Here regions are fused, as
-in Nguyen and Brown (*Fast and Effective L0 Gradient Minimization by Region Fusion*, ICCV 2015): it starts with one
-region per pixel, and fuses two neighbours if this costs less than the boundary between them, whose weight grows to its
-value in a few levels. Many are fused at once, in disjoint groups, and only if this lowers E at the current weight. No
-fusion of two of the resulting regions lowers E. A region's best albedo is sum (shading * rgb) / sum shading^2 in each
-channel, clamped to 0 .. BRIGHTEST, because a shading near 0 does not determine it.
+the Potts prior of Haefner et al. (CVPR 2018). Regions are fused, as in Nguyen and Brown (*Fast and Effective L0
+Gradient Minimization by Region Fusion*, ICCV 2015): from one region per pixel, two neighbours are fused if this costs
+less than the boundary between them, whose weight grows to its value in a few levels. Many are fused at once, in
+disjoint groups, and only if this lowers E at the current weight.
 """
 
 from __future__ import annotations
@@ -42,7 +40,7 @@ class _Borders(NamedTuple):
 
 
 def fuse(rgb: Tensor, shading: Tensor, weight: float, inside: Tensor) -> Regions:
-    """Return regions that are a local minimum of E, equal for equal input.
+    """Return regions of which no fusion of two lowers E, equal for equal input.
 
     Image and shading are (B, C, H, W) float64, ``weight`` is that of a unit of boundary length, and ``inside`` the mask
     (B, 1, H, W) of the problem; each pixel outside is a region of its own.
@@ -62,7 +60,12 @@ def fuse(rgb: Tensor, shading: Tensor, weight: float, inside: Tensor) -> Regions
             products = products.index_add(0, parent[joined], products[joined])[roots]
             renamed = (roots.cumsum(0) - 1)[parent]
             labels = renamed[labels]
-            borders = _merge_borders(borders, renamed, len(squares))
+            one, other = renamed[borders.one], renamed[borders.other]
+            apart, count = one != other, len(squares)
+            low, high = torch.minimum(one, other)[apart], torch.maximum(one, other)[apart]
+            keys, places = torch.unique(low * count + high, return_inverse=True)  # each pair of regions once
+            length = torch.zeros_like(keys).index_add_(0, places, borders.length[apart])
+            borders = _Borders(keys // count, keys % count, length)
     return Regions(labels.reshape(batch, height, width), len(squares))
 
 
@@ -144,13 +147,3 @@ def _hash(number: Tensor) -> Tensor:
         number = (number * _SHUFFLE) % _RANGE
         number = number ^ (number >> 15)
     return number
-
-
-def _merge_borders(borders: _Borders, renamed: Tensor, count: int) -> _Borders:
-    """Return the borders after regions were renamed, each pair once."""
-    one, other = renamed[borders.one], renamed[borders.other]
-    apart = one != other
-    low, high = torch.minimum(one, other)[apart], torch.maximum(one, other)[apart]
-    keys, places = torch.unique(low * count + high, return_inverse=True)
-    length = torch.zeros_like(keys).index_add_(0, places, borders.length[apart])
-    return _Borders(keys // count, keys % count, length)

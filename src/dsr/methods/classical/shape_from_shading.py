@@ -8,22 +8,21 @@ Super-Resolution from Shading*, CVPR 2018, minimise
     shading = l_1 n_x + l_2 n_y + l_3 n_z + l_4,    n = m / |m|,    m = (p, q, -z - x p - y q),
 
 with z in pixels here (times the focal length, by the median depth), the slopes p = fx dz/du and q = fy dz/dv, and the
-ray (x, y, 1) of the pixel. The shading is Lambertian under first-order spherical harmonics; m faces the camera, and a
-pixel sees the area z |m| / (fx fy). With a copy theta of (p, q, z) and the scaled multiplier u, the augmented
-Lagrangian is E with theta in all terms except for the data term, plus
-penalty / 2 * (|(p, q, z) + u - theta|^2 - |u|^2). Alternating steps lower it: the albedo by region fusion
-(:mod:`dsr.methods.classical.potts`), the lighting by least squares, theta by Levenberg and Marquardt's method, z by
-conjugate gradients.
+ray (x, y, 1) of the pixel. With a copy theta of (p, q, z) and the scaled multiplier u, the augmented Lagrangian is E
+with theta in all terms except for the data term, plus penalty / 2 * (|(p, q, z) + u - theta|^2 - |u|^2). Alternating
+steps lower it: the albedo by region fusion (:mod:`dsr.methods.classical.potts`), the lighting by least squares, theta
+by Levenberg and Marquardt's method, z by conjugate gradients.
 
 What differs, besides the weights (the original's: data 0.0015, area 1e-7, boundary 0.5 at x4 with a focal length of 500
-pixels): each channel has its own light; the penalty of the copy of z is weighted by 1 / scale^2, because with 1 a step
-spreads over a pixel, and blocks have several; theta's 3 x 3 systems are solved in closed form, not by BFGS; it starts
-from the bicubic map, not smoothed first, which stays unchanged outside the foreground. Holes have no data term.
+pixels): each channel has its own light; the penalty of the copy of z is weighted by 1 / scale^2; theta's 3 x 3 systems
+are solved in closed form, not by BFGS; it starts from the bicubic map, which stays unchanged outside the foreground.
+Holes have no data term.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,7 +31,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.geometry.camera import RangeType
 from dsr.geometry.surface import length
 from dsr.methods.base import Abilities, Cost, Method, expect_positive, whole_scale
 from dsr.methods.classical.potts import Regions, boundary_length, fit_albedo, fuse
@@ -173,12 +171,19 @@ class ShadingSolver:
 
     def update_depth(self) -> None:
         """Lower the Lagrangian, which is quadratic in z, by conjugate gradients from the current z."""
+
+        def curvature(z: Tensor) -> Tensor:  # the second derivative in z, times z; 0 outside the mask
+            inside = self._weight * z
+            own = self.penalty * self.slopes.adjoint(self.coupling * self.slopes(inside))
+            return self._weight * (own + data_weight * self._block_means_adjoint(self._block_means(inside)))
+
+        data_weight = self.problem.data_weight
         wanted = self.theta - self.missed - self.slopes(self.z)
         right = self._weight * (
-            self.problem.data_weight * self._block_means_adjoint(self._lr - self._block_means(self.z))
+            data_weight * self._block_means_adjoint(self._lr - self._block_means(self.z))
             + self.penalty * self.slopes.adjoint(self.coupling * wanted)
         )
-        self.z = self.z + conjugate_gradients(self._normal_operator, right, _CG_ITERATIONS, _CG_TOLERANCE)
+        self.z = self.z + conjugate_gradients(curvature, right, _CG_ITERATIONS, _CG_TOLERANCE)
 
     def update_missed(self, growth: float) -> None:
         """Add (p, q, z) - theta to the multiplier, and multiply the penalty."""
@@ -231,12 +236,6 @@ class ShadingSolver:
         hessian = torch.cat(triangle, dim=1) * self._weight
         hessian[:, [0, 3, 5]] += self.penalty * self.coupling
         return gradient, hessian
-
-    def _normal_operator(self, z: Tensor) -> Tensor:
-        """Return the second derivative of the Lagrangian in z, times z; 0 outside the mask."""
-        inside = self._weight * z
-        own = self.penalty * self.slopes.adjoint(self.coupling * self.slopes(inside))
-        return self._weight * (own + self.problem.data_weight * self._block_means_adjoint(self._block_means(inside)))
 
     def _block_means(self, z: Tensor) -> Tensor:
         return torch.where(self._valid, box_mean(z, self.scale), 0)
@@ -302,6 +301,7 @@ def conjugate_gradients(
     return x
 
 
+@dataclass(eq=False)
 class ShapeFromShading(Method):
     """Variational super-resolution from shading.
 
@@ -326,31 +326,25 @@ class ShapeFromShading(Method):
     """
 
     abilities = Abilities(fast_on="cpu", cost=Cost(1300, 60))
-    range_type: RangeType = "orthogonal"
+    range_type = "orthogonal"
 
-    def __init__(
-        self,
-        iterations: int = 40,
-        tolerance: float = 1e-4,
-        data_weight: float = 100.0,
-        area_weight: float = 0.2,
-        boundary_weight: float = 0.1,
-        penalty: float = 0.02,
-        growth: float = 1.3,
-        foreground: str | None = None,
-    ) -> None:
-        expect_positive(iterations=iterations)
-        expect_positive(or_zero=True, tolerance=tolerance, area_weight=area_weight)
-        if not 1 <= growth < float("inf"):
-            raise ValueError(f"growth: expected at least 1, got {growth}")
-        expect_positive(data_weight=data_weight, boundary_weight=boundary_weight, penalty=penalty)
-        if foreground is not None and not Path(foreground).is_dir():
-            raise ValueError(f"foreground: expected a folder of masks, there is none at {foreground}")
-        self.iterations, self.tolerance = iterations, tolerance
-        self.data_weight, self.area_weight, self.boundary_weight = data_weight, area_weight, boundary_weight
-        self.penalty, self.growth = penalty, growth
-        self.foreground = None if foreground is None else Path(foreground)
-        self.history: list[dict[str, float]] = []
+    iterations: int = 40
+    tolerance: float = 1e-4
+    data_weight: float = 100.0
+    area_weight: float = 0.2
+    boundary_weight: float = 0.1
+    penalty: float = 0.02
+    growth: float = 1.3
+    foreground: str | None = None
+
+    def __post_init__(self) -> None:
+        expect_positive(iterations=self.iterations, penalty=self.penalty)
+        expect_positive(data_weight=self.data_weight, boundary_weight=self.boundary_weight)
+        expect_positive(or_zero=True, tolerance=self.tolerance, area_weight=self.area_weight)
+        if not 1 <= self.growth < float("inf"):
+            raise ValueError(f"growth: expected at least 1, got {self.growth}")
+        if self.foreground is not None and not Path(self.foreground).is_dir():
+            raise ValueError(f"foreground: expected a folder of masks, there is none at {self.foreground}")
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
@@ -388,7 +382,8 @@ class ShapeFromShading(Method):
         camera = sample.camera
         inside = torch.ones(1, 1, camera.height, camera.width, dtype=torch.bool, device=lr.device)
         if self.foreground is not None:
-            mask = read_foreground(self.foreground / f"{sample.scene}.png", (camera.height, camera.width))
+            path = Path(self.foreground) / f"{sample.scene}.png"
+            mask = read_foreground(path, (camera.height, camera.width))
             inside = torch.from_numpy(mask)[None, None].to(lr.device)
         unit = (camera.fx * camera.fy) ** 0.5
         metres = float(lr[lr.isfinite()].median()) / unit

@@ -9,8 +9,8 @@ low-resolution version D d is compared with the input d_LR, and the intensity of
 with the range r of the input, and c = 10 for MSE, 1 for Lap_1. Holes of the input have no data term; the network fills
 them. The result is a moving average of the depth maps of all steps.
 
-The network is the hourglass of Ulyanov et al., supplementary material. What differs: convolutions are padded with
-zeros, the last one always computes in float32, and the widths may differ between levels.
+The network is the hourglass of Ulyanov et al. What differs: convolutions are padded with zeros, the last one always
+computes in float32, and the widths may differ between levels.
 """
 
 from __future__ import annotations
@@ -98,7 +98,6 @@ class DeepImagePrior(Method):
     lpips_trunk: str | Path | None = None
 
     def __post_init__(self) -> None:
-        """Check the options, and load the network of LPIPS."""
         self.device = torch.device(self.device)
         w = 1.0 if self.w == "auto" else self.w
         expect_positive(steps=self.steps, learning_rate=self.learning_rate)

@@ -37,8 +37,7 @@ _BICUBIC = 2  # half width of the bicubic kernel in low-resolution pixels
 def polynomial_filters(size: int) -> Tensor:
     """Return an orthonormal basis of filters, ordered by degree: 1, u, v, ...; float64 (size^2, size, size).
 
-    They are products of two discrete orthogonal (Gram) polynomials, one along v and one along u. Without the first
-    filter, they have response 0 to constants, without the first three to planes.
+    They are products of two discrete orthogonal (Gram) polynomials; those after the third have response 0 to planes.
     """
     with torch.inference_mode(mode=False):  # the cached tensors may later be used with gradients
         x = torch.linspace(-1, 1, size, dtype=torch.float64)

@@ -5,9 +5,7 @@ sees the low-resolution grid down to an eighth of its size. Planes choose among 
 it, and are averaged with those around them in five steps of 1 to 16 pixels. The roughness of the map and the hints
 scale and shift the features of each block (Perez et al., *FiLM*, AAAI 2018), and mix its weights from two sets (Yang
 et al., *CondConv*, NeurIPS 2019). Where the kernel is known, the residual is added back twice (Irani, Peleg, CVGIP
-1991). Maps of the photo's own size are averaged over 2 x 2 pixels for the trunk, and have the weights of factor 2. Two
-more outputs are the expected errors of the logarithm of disparity and of the normal. The layers at the low resolution
-are alike for all factors. Disparity is divided by its median, so that the result does not depend on the unit.
+1991). Maps of the photo's own size have the weights of factor 2. Disparity is divided by its median.
 """
 
 from __future__ import annotations

@@ -7,9 +7,8 @@ the upsampled map becomes f, and weights w. A fixed number of steps of Chambolle
     E(u) = sum over pairs (i, i + d) of h(u[i + d] - u[i], w[i, d]) + data / 2 * sum (u - f)^2,
 
 with d half of the offsets of a square window and h(x, w) = x^2 / (2 huber) where |x| <= huber w, else
-w |x| - huber / 2 w^2. What differs is in docs/measurements/methods.md; the *bend*, the unit of the residual, is the
-largest second difference of the low-resolution map around a pixel (:mod:`dsr.methods.networks.facets_planes`), which is
-0 on planes.
+w |x| - huber / 2 w^2. What differs is in docs/measurements/methods.md; the unit of the residual is the *bend* of
+:mod:`dsr.methods.networks.facets_planes`.
 """
 
 from __future__ import annotations

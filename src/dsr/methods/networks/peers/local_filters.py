@@ -49,8 +49,7 @@ class SVLRM(PeerNetwork):
     def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
         """Enlarge a map by cubic interpolation, shifted to the left and upwards by (scale - 1) / 2 pixels.
 
-        The authors' training takes the last pixel of each block as the low-resolution value and enlarges the map as if
-        it were the middle one, so the network has learnt to undo such a shift.
+        The authors' training takes the last pixel of each block for its middle, so the network undoes such a shift.
         """
         shift, (height, width) = (self.scale - 1) / 2, values_lr.shape[-2:]
         down = _cubic_interpolation(height, size[0], shift).to(values_lr)
