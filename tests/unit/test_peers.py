@@ -17,8 +17,7 @@ from torch.nn import functional
 
 from dsr.geometry.camera import Camera, from_range
 from dsr.methods.base import Cost
-from dsr.methods.images import inpaint, resize_bicubic
-from dsr.methods.networks.dct import dct2, idct2
+from dsr.methods.images import dct2, idct2, inpaint, resize_bicubic
 from dsr.methods.networks.peers import dctnet, dornet, local_filters, pgsr
 from dsr.methods.networks.peers.dctnet import DCTNet, laplacian, transfer_edges
 from dsr.methods.networks.peers.dornet import DORNet, deformable_conv3x3

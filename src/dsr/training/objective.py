@@ -20,8 +20,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.surface import angle_between
-from dsr.methods.images import compute_min_max, grey, upsample_bicubic
-from dsr.methods.networks.dct import dct2, idct2, laplacian_eigenvalues
+from dsr.methods.images import compute_min_max, dct2, grey, idct2, laplacian_eigenvalues, upsample_bicubic
 from dsr.methods.networks.network import Answer, DisparityNetwork
 from dsr.metrics.functional import SurfacePair, masked_mean, mse_v
 from dsr.metrics.losses import MSE_V, VisualLoss, VisualLossName, l1, lap1, make_visual_loss, match_weight, mse

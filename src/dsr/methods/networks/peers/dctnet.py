@@ -18,8 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.base import Cost
-from dsr.methods.images import normalise_imagenet
-from dsr.methods.networks.dct import dct2, idct2, laplacian_eigenvalues
+from dsr.methods.images import dct2, idct2, laplacian_eigenvalues, normalise_imagenet
 from dsr.methods.networks.peers.peer_network import PeerNetwork
 
 FEATURES = 64
