@@ -118,8 +118,7 @@ class Surface(NamedTuple):
     def shares(self, limit: float) -> dict[str, float]:
         """Return the shares of the pixels that are ``measured``, ``filled`` and ``open``, which have no depth.
 
-        If ``filled`` is None, all depth is measured. With expected errors also the share of ``dubious`` depth, which is
-        expected to be off by more than ``limit`` of it, and of ``glass``, if it was looked for.
+        With expected errors also that of ``dubious`` depth, see :meth:`without_dubious`, and of ``glass``, if known.
         """
         known = self.depth.isfinite()
         filled = known & self.filled if self.filled is not None else known & False
@@ -185,7 +184,7 @@ class Method(abc.ABC):
         range_type: the range type that it works on. By default the downsampling model is applied to that
             type, too, as in the paper, which evaluates every method on the type that it was designed for.
         history: of the last call of a method that iterates, one entry per recorded iteration: ``iteration`` first, then
-            the method's own quantities, such as ``objective`` and ``moved``, in an order of its own. None for others.
+            the method's own quantities, such as ``objective`` and ``moved``. None for others.
         name: in scores and tables, of a method that takes it from its input; None for that of its file of ``conf``.
 
     """
@@ -210,7 +209,7 @@ class Method(abc.ABC):
         """Return the HR orthogonal depth, (1, H, W) in metres on the sample's device, NaN where missing.
 
         A method never reads ``sample.depth``. One that takes several steps calls ``progress`` with the steps done and
-        their total. It raises a :class:`NoSolutionError` if there is no solution for this image.
+        their total.
         """
 
     def surface(self, sample: DepthSample, progress: Steps | None = None) -> Surface:

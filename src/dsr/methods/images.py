@@ -1,7 +1,6 @@
 """Operations on images and maps that methods share: values, sizes, holes, noise and cosine transforms.
 
-While a network is exported to ONNX, some of them do the same in another way: in a graph no size of a tensor depends on
-values, and a loop that ends when nothing is missing has to be written as one.
+While a network is exported to ONNX, some of them do the same in another way: in a graph no size depends on values.
 """
 
 from __future__ import annotations
@@ -52,8 +51,8 @@ class Normalised(NamedTuple):
 def normalise(x: Tensor, min_max: Tensor | None = None) -> Normalised:
     """Return (x - min) / (max - min) per sample of (B, 1, H, W), over the finite values; the others become 0.
 
-    A constant map becomes 0 with a range of 0. Without a finite value, the minimum is NaN. ``min_max`` (B, 2, 1, 1) are
-    the minimum and maximum to use; None for those of the map.
+    A constant map becomes 0 with a range of 0. Without a finite value, the minimum is NaN. ``min_max`` (B, 2, 1, 1) is
+    what to use in place of the map's own.
     """
     min_max = compute_min_max(x) if min_max is None else min_max.to(x)
     minimum = min_max[:, :1]
@@ -143,9 +142,8 @@ def lr_coordinates(camera: Camera, camera_lr: Camera, device: torch.device | str
 def inpaint(x: Tensor, photo: Tensor | None = None) -> Tensor:
     """Replace the non-finite values of (B, 1, h, w) by means of the valid ones in 3 x 3 pixels, from outside in.
 
-    With a photo, the means are weighted by how alike the colours are, and pixels of the colour of a valid neighbour are
-    filled before others, so that values stop at the photo's edges. An image without a valid value stays unchanged. The
-    photo is (B, 3, H, W) in [0, 1], of any size.
+    With a photo, (B, 3, H, W) in [0, 1] of any size, the means are weighted by how alike the colours are, and pixels of
+    the colour of a valid neighbour are filled before others. An image without a valid value stays unchanged.
     """
     if not exporting() and bool(x.isfinite().all()):
         return x
@@ -243,8 +241,7 @@ def estimate_noise(depth_lr: Tensor) -> float:
     """Return the standard deviation of the relative noise of a depth map, (1, 1, h, w) in metres, NaN in holes.
 
     Immerkaer, *Fast Noise Variance Estimation*, CVIU 1996: the difference of two Laplacians, which is 0 on planes and
-    on straight edges; here of the logarithm of depth, with the 10th percentile instead of the mean: noise is
-    everywhere, while steps and curves of the surface are not. It is 0 without a valid 3 x 3 window.
+    on straight edges; here of the logarithm of depth, with the 10th percentile instead of the mean.
     """
     # a tenth of a normal variable's absolute values are below 0.12566 standard deviations
     return _low_quantile(depth_lr.double().log(), 1, 0.1) / 0.12566 / 6
@@ -253,9 +250,9 @@ def estimate_noise(depth_lr: Tensor) -> float:
 def estimate_sensor_noise(values: Tensor) -> float:
     """Return the standard deviation of a map's noise, also where a sensor rounds its values or neighbours share noise.
 
-    As :func:`estimate_noise`, with a quarter of the responses instead of a tenth, because rounding makes many of them
-    0, and the larger of the estimates from neighbouring pixels and from every second one, because the first misses
-    correlated noise. ``values`` (1, 1, h, w) are in a unit in which planes are linear and noise is alike everywhere.
+    As :func:`estimate_noise`, with a quarter of the responses, because rounding makes many of them 0, and the larger of
+    the estimates from neighbouring pixels and from every second one, because the first misses correlated noise.
+    ``values`` (1, 1, h, w) are in a unit in which planes are linear and noise is alike everywhere.
     """
     # a quarter of a normal variable's absolute values are below 0.31864 standard deviations
     return max(_low_quantile(values.double(), stride, 0.25) for stride in (1, 2)) / 0.31864 / 6

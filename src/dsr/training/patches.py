@@ -1,8 +1,7 @@
 """Training patches: random windows of scenes, mirrored, turned, scaled in depth and changed in colour at random.
 
 Patch number i of a run is a pure function of (seed, i), and of the number of patches of a step where factors are drawn.
-So an interrupted run continues with the same patches, whatever the number of workers, and the patches of a step are the
-same on one device and on several.
+So an interrupted run continues with the same patches, whatever the number of workers and devices.
 """
 
 from __future__ import annotations

@@ -151,14 +151,10 @@ class DeepImagePrior(Method):
                 logger.log_hyperparams(settings)
                 list_run(logger.experiment, "optimisation", settings, {})
             trainer = make_trainer(
-                torch.device(self.device),
-                self.steps,
-                min(self.validate_every or self.steps, self.steps),
-                callbacks=callbacks,
-                logger=logger,
-                limit_val_batches=1 if self.validate_every else 0,
+                torch.device(self.device), self.steps, min(self.validate_every or self.steps, self.steps),
+                callbacks=callbacks, logger=logger, limit_val_batches=1 if self.validate_every else 0,
                 enable_checkpointing=False,
-            )
+            )  # fmt: skip
             fit(trainer, module, _numbers(self.steps), val_dataloaders=_numbers(1))
         return module.best[0].to(sample.depth_lr)
 

@@ -155,7 +155,11 @@ class AnyMap(Method):
             return _resize(error, (height, width))[0].to(depth)
 
         focal = sample.camera_lr.fx
-        rounding, tilt, guessing = (each.to(depth) for each in (*_rounding(inverse, focal), _guessing(inverse, focal)))
+        known, guessing = inverse.isfinite(), torch.zeros_like(inverse)  # in holes beyond what the network expects
+        if not bool(known.all()):
+            away = torch.stack([distance_to_known(each) for each in known])
+            guessing = (_PER_DEGREE * degrees_per_pixel(focal) * away).clamp(max=1)
+        rounding, tilt, guessing = (each.to(depth) for each in (*_rounding(inverse, focal), guessing))
         spread = torch.maximum(self._caution * fit(answer.spread[inside]), fit(rounding)) + fit(guessing)
         angle = torch.maximum(self._caution * fit(answer.angle[inside]), fit(tilt))
         depth_error = spread * depth
@@ -188,21 +192,12 @@ def _describe_noise(given: Tensor, answer: Answer) -> MapNoise:
     return MapNoise(float(variance.sqrt() * depth), _extent(error, known, float(variance)), float(depth))
 
 
-def _guessing(inverse: Tensor, focal: float) -> Tensor:
-    """Return the relative error of depth in holes beyond what the network expects, by distance, (B, 1, h, w)."""
-    known = inverse.isfinite()
-    if bool(known.all()):
-        return torch.zeros_like(inverse)
-    distance = torch.stack([distance_to_known(each) for each in known])
-    return (_PER_DEGREE * degrees_per_pixel(focal) * distance).clamp(max=1)
-
-
 def _rounding(inverse: Tensor, focal: float) -> tuple[Tensor, Tensor]:
     """Return the expected errors of maps rounded to few values, (B, 1, h, w), 0 where the values around a pixel differ.
 
-    That of depth is relative: a quarter of the step to the next value, the mean of errors that are equally likely up to
-    half a step. That of the normal, in radians, is the tilt of a surface that gains it up to the next other value. A
-    rounded slope is a staircase; its largest relative step, twice, limits those of single levels.
+    That of depth is relative: a quarter of the step to the next value. That of the normal, in radians, is the tilt of a
+    surface that gains it up to the next other value. A rounded slope is a staircase; its largest relative step, twice,
+    limits those of single levels.
     """
     nothing, known = torch.zeros_like(inverse), inverse.isfinite()
     values = inverse[known].unique()

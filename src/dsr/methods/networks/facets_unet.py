@@ -175,7 +175,7 @@ class FacetsUNet(DisparityNetwork):
 
         ``rgb`` is (B, 3, H, W) in [0, 1], ``disparity`` (B, 1, h, w), positive, with non-finite holes, ``noise``
         (B, 1, h, w) the standard deviation of its logarithm and ``hints`` (B, ``FACTS``), if they are known; ``filled``
-        the disparity without holes and ``kernels`` those of the hints, if they were computed before.
+        and ``kernels`` are what :meth:`prepare` computes.
         """
         expect_rgb_size(rgb, disparity, 1 if self.scale < 4 and rgb.shape[-1] == disparity.shape[-1] else self.scale)
         known = disparity.isfinite()
@@ -204,8 +204,7 @@ class FacetsUNet(DisparityNetwork):
     ) -> tuple[Tensor, Tensor]:
         """Return high-resolution values, (B, 1, H, W), and the logarithms of both expected errors, (B, 2, H, W).
 
-        ``values`` (B, 1, h, w) are disparity over its median, without holes, ``known`` (B, 1, h, w) false where one was
-        filled in, ``noise`` the standard deviation of their logarithm where that is known.
+        ``values`` (B, 1, h, w) are disparity over its median, ``known`` (B, 1, h, w) false where a hole was filled in.
         """
         scale, given = int(rgb.shape[-1] // values.shape[-1]), values
         dtype = self.photo.weight.dtype

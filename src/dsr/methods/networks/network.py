@@ -1,9 +1,8 @@
 """The networks, which map low-resolution disparity and an RGB image to high-resolution disparity, and their method.
 
-Large images are computed in tiles of low-resolution pixels, which bounds the memory. A tile is computed from a window
-with half of the overlap with its neighbours and a margin of the receptive-field radius, so that neighbours agree where
-they overlap; they are blended there with linear ramps. Values of the whole image, such as the range of the disparity,
-are computed before.
+Large images are computed in tiles of low-resolution pixels, from windows with half of the overlap with the neighbours
+and a margin of the receptive-field radius, and blended with linear ramps. Values of the whole image, such as the range
+of the disparity, are computed before.
 """
 
 from __future__ import annotations
@@ -98,9 +97,8 @@ class DisparityNetwork(nn.Module, abc.ABC):
         """Return high-resolution disparity, (B, 1, H, W) in the dtype of ``disparity``; NaN without a valid pixel.
 
         ``rgb`` is (B, 3, H, W) in [0, 1], ``disparity`` (B, 1, h, w) in pixels of the high-resolution camera with
-        non-finite holes, ``min_max`` (B, 2, 1, 1) the range of the image that this is a window of, for the
-        normalisation; None for that of ``disparity``. With a receptive-field radius, a network takes all of its
-        :meth:`context` as further arguments.
+        non-finite holes, ``min_max`` (B, 2, 1, 1) the range of the image that this is a window of. With a
+        receptive-field radius, a network takes all of its :meth:`context` as further arguments.
         """
 
     def context(self, rgb: Tensor, disparity: Tensor) -> tuple[Tensor | None, ...]:
@@ -128,9 +126,8 @@ class DisparityNetwork(nn.Module, abc.ABC):
 class NormalisedNetwork(DisparityNetwork):
     """A network whose input is an RGB image and inpainted low-resolution disparity, normalised to 0..1.
 
-    The output is rescaled to the range of the input, so the network commutes with affine maps of the disparity, and a
-    constant map stays constant. The module maps (B, 3, H, W) and (B, 1, h, w) to (B, 1, H, W); for a window it gets
-    what :meth:`context` returns beside the range as further arguments.
+    The output is rescaled to the range of the input. The module maps (B, 3, H, W) and (B, 1, h, w) to (B, 1, H, W); for
+    a window it gets what :meth:`context` returns beside the range as further arguments.
     """
 
     def upsample(
@@ -324,8 +321,7 @@ def blend_tiles(
 ) -> Tensor:
     """Compute an image, (B, C, scale * h, scale * w), tile by tile and blend the tiles.
 
-    ``compute`` maps rows and columns of low-resolution pixels to their high-resolution pixels. It may leave out the
-    last high-resolution row and column, which the result then lacks.
+    ``compute`` maps rows and columns of low-resolution pixels to high-resolution pixels, perhaps without the last ones.
     """
     total = torch.empty(0)
     for done, (row, column) in enumerate(itertools.product(rows, columns), 1):

@@ -45,8 +45,7 @@ def half_window(window: int) -> list[tuple[int, int]]:
 def pair_differences(x: Tensor, window: int) -> Tensor:
     """Return x[i + d] - x[i] for each pixel i whose pair may touch the image, and each offset d of :func:`half_window`.
 
-    ``x`` is (B, 1, H + 2 r, W + 4 r), the image, r rows above and below, 2 r columns on the left and the right; r is
-    the window's radius. The result is (B, N, H + r, W + 2 r): of the image, r rows below, r columns on either side.
+    With the window's radius r, ``x`` is (B, 1, H + 2 r, W + 4 r), the result (B, N, H + r, W + 2 r).
     """
     r = window // 2
     height, width = x.shape[-2] - r, x.shape[-1] - 2 * r

@@ -115,9 +115,8 @@ def save_network(
 ) -> None:
     """Write a network's weights, not atomically; equal networks and facts give equal bytes.
 
-    ``model`` is its name in ``conf/model``, ``facts`` are further plain values for readers of the file, ``half`` stores
-    the kernels of convolutions in half precision, and ``links`` are other files of weights in the same folder by keys
-    of ``LINKS``: tensors that the ``shared`` one has, too, are not written again.
+    ``model`` is its name in ``conf/model``, ``half`` stores the kernels of convolutions in half precision, ``links``
+    are other files in the same folder by keys of ``LINKS``: tensors that the ``shared`` one has are not written again.
     """
     header = {
         "format": FORMAT,

@@ -1,9 +1,8 @@
 """The method that runs a published network of the field.
 
-Such a network maps a photo and an enlarged map in 0..1 to a refined map in 0..1. Its authors trained it on depth or on
-disparity of one data set, normalised; most of them normalise by the minimum and the maximum of the *true* map, which no
-method can know. :class:`Peer` takes those of the low-resolution map, and the true ones only on request, to reproduce
-the authors' figures.
+Such a network maps a photo and an enlarged map in 0..1 to a refined map in 0..1. Most authors normalise by the minimum
+and the maximum of the *true* map, which no method can know. :class:`Peer` takes those of the low-resolution map, and
+the true ones only on request, to reproduce the authors' figures.
 """
 
 from __future__ import annotations
