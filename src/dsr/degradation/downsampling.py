@@ -272,10 +272,7 @@ def known_kernels(facts: Tensor) -> list[str | None]:
 
 
 def relative_error(given: Tensor, result: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the relative error, 0 in holes and of outliers, and the known pixels, 0 or 1, (B, 1, h, w) each.
-
-    ``given`` (B, 1, h, w) and ``result`` (B, 1, H, W) are inverse depth.
-    """
+    """Return the relative error of inverse depth, 0 in holes and of outliers, and the known pixels, (B, 1, h, w)."""
     scale = result.shape[-1] // given.shape[-1]
     error = given / functional.avg_pool2d(result, scale) - 1
     known = error.isfinite() & (error.abs() < _LARGEST)

@@ -75,10 +75,7 @@ class Shadows:
 
 
 def occluded(disparity: Tensor) -> Tensor:
-    """Return the mask of the pixels that a nearer one covers in a second image, (..., h, w) bool.
-
-    The disparity, (..., h, w) in pixels, is negative if the second camera is to the left.
-    """
+    """Return the mask of pixels, (..., h, w), that a nearer one covers in a second image, to the left if negative."""
     if bool((disparity < 0).any()):
         return occluded(-disparity.flip(-1)).flip(-1)
     seen_at = torch.arange(disparity.shape[-1], device=disparity.device) - disparity  # the column in the second image

@@ -156,10 +156,7 @@ def significances(depths: Sequence[Outlines], photos: Sequence[Outlines]) -> Arr
 
 
 def find_misplaced(agreements: Array) -> list[tuple[int, int]]:
-    """Return the depth maps that fit another's photo clearly better than their own, each with that photo.
-
-    The agreements are the significance of each depth map with each photo, (N, N), of a pair on the diagonal.
-    """
+    """Return the pairs of a depth map and of another's photo that it fits clearly better, by significances (N, N)."""
     gains = agreements - np.maximum(np.diag(agreements), 0.0)[:, None]
     best = gains.argmax(axis=1) if gains.size else np.empty(0, int)
     least = LIMITS["photo-turned"]
@@ -182,10 +179,7 @@ def reduce_photo(rgb: Tensor, size: Size) -> _Floats:
 
 
 def photo_outlines(photo: _Floats, pixel: float) -> Outlines:
-    """Return the edges of a photo, (H, W, 3) at the size of the grid, relative to the mean gradient around each.
-
-    ``pixel`` is the width of a pixel of the depth map on the grid.
-    """
+    """Return the edges of a photo on the grid, (H, W, 3); ``pixel`` is the width of the depth map's pixel there."""
     right, down = _gradient(photo, max(pixel, 1.0) ** 0.5)
     steepest = (right * right + down * down).argmax(axis=-1)[..., None]
     right = np.take_along_axis(right, steepest, axis=-1)[..., 0]

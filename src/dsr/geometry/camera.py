@@ -130,10 +130,7 @@ class Camera:
         return derived(self, width=int(width), height=int(height), cx=float(self.cx - left), cy=float(self.cy - top))
 
     def rescale(self, width: int, height: int) -> Camera:
-        """Return the camera of the same view, resampled to ``width x height`` pixels that cover the same area.
-
-        The image's outer edge (half a pixel beyond the first pixel centre) stays where it is, as for box downsampling.
-        """
+        """Return the camera of the same view in ``width x height`` pixels; the image's outer edge stays where it is."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self,
@@ -181,10 +178,7 @@ class Camera:
         )
 
     def rotate90(self, turns: int = 1) -> Camera:
-        """Return the camera of the image turned by ``turns`` quarter turns counterclockwise, as ``torch.rot90`` does.
-
-        The baseline stays unchanged, because it only serves to convert between depth and disparity.
-        """
+        """Return the camera of the image turned by quarter turns counterclockwise, as by ``torch.rot90``."""
         camera = self
         for _ in range(turns % 4):
             camera = derived(
@@ -246,10 +240,7 @@ def to_range(depth: Tensor, camera: Camera, range_type: RangeType) -> Tensor:
 
 
 def from_range(values: Tensor, camera: Camera, range_type: RangeType) -> Tensor:
-    """Convert a range map to orthogonal depth in metres: the inverse of :func:`to_range`.
-
-    A disparity at or below -doffs lies at or beyond infinity and becomes NaN, a hole.
-    """
+    """Convert a range map to orthogonal depth in metres; disparities at or beyond infinity become NaN, a hole."""
     expect_one_of("range_type", range_type, RANGE_TYPES)
     if range_type == "orthogonal":
         return values

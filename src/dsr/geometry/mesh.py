@@ -83,10 +83,7 @@ def triangulate(
 
 
 def vertex_normals(mesh: Mesh) -> np.ndarray:
-    """Return the unit normals of the vertices, (N, 3) float32: the mean of their triangles', weighted by area.
-
-    The normal of a vertex without a triangle points to the camera.
-    """
+    """Return the unit normals of the vertices, (N, 3) float32: the mean of their triangles', weighted by area."""
     total = np.zeros((len(mesh.vertices), 3))
     for start in range(0, len(mesh.faces), _STRIP):
         faces = mesh.faces[start : start + _STRIP]
@@ -207,10 +204,7 @@ def _leaves(needed: np.ndarray, rows: int, columns: int) -> tuple[np.ndarray, np
 
 
 def find_connections(inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which neighbouring pixels of inverse depth, (H, W) in 1/m, lie on one surface, those that a mesh joins.
-
-    These are whether each pixel and its right neighbour do, (H, W - 1) bool, and each pixel and the one below.
-    """
+    """Return whether each pixel of inverse depth, (H, W), is on one surface with its right and its lower neighbour."""
     return _connected(inverse), _connected(inverse.T).T
 
 
@@ -265,10 +259,7 @@ def thin(depth: Tensor, camera: Camera, most: int) -> tuple[Mesh, int]:
 
 
 def select_points(mesh: Mesh, most: int, camera: Camera) -> np.ndarray:
-    """Return the indices of at most ``most`` vertices of an unsimplified mesh, (N,), evenly spread in the image.
-
-    They are those in rows and columns at equal distances, which need not be whole numbers of pixels.
-    """
+    """Return the indices of at most ``most`` vertices of an unsimplified mesh, (N,), evenly spread in the image."""
     count = len(mesh.pixels)
     if count <= most:
         return np.arange(count)

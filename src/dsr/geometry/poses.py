@@ -26,10 +26,7 @@ _TOLERANCE = 5e-3
 
 
 def as_rigid(values: Sequence[Sequence[float]] | np.ndarray, name: str) -> Matrix:
-    """Return a 3 x 4 or 4 x 4 transform as a 4 x 4 matrix whose rotation is orthonormal to rounding.
-
-    Errors begin with ``name``, such as the file that the numbers are from.
-    """
+    """Return a 3 x 4 or 4 x 4 transform as a 4 x 4 matrix with an orthonormal rotation; errors begin with ``name``."""
     expected = f"{name}: expected a matrix of 3 x 4 or 4 x 4 numbers, got"
     try:
         if not isinstance(values, np.ndarray) and any(isinstance(each, bool | str) for row in values for each in row):
@@ -59,10 +56,7 @@ def as_rigid(values: Sequence[Sequence[float]] | np.ndarray, name: str) -> Matri
 
 
 def orthonormal_error(turn: np.ndarray) -> float:
-    """Return how far the rows of a matrix R, (3, 3), are from orthonormal: the largest magnitude in R R' - 1.
-
-    It is infinite or NaN where the numbers are too large for that.
-    """
+    """Return the largest magnitude in R R' - 1 of a matrix R, (3, 3); infinite or NaN for numbers too large."""
     with np.errstate(over="ignore", invalid="ignore"):
         return float(np.abs(turn @ turn.T - np.eye(3)).max())
 

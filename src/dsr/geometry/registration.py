@@ -232,10 +232,7 @@ def _standard_errors(gains: Array) -> float:
 
 
 def _search(comparison: _Comparison) -> tuple[float, float, float]:
-    """Return the best shift down and right with its scale, which is 1 unless another one clearly gains.
-
-    A search by every second pixel and in steps of scale gives the starts of those to fractions of a pixel.
-    """
+    """Return the best shift down and right with its scale, which is 1 unless another one clearly gains."""
     blur = 0.5 * comparison.pixel + 0.3  # about the uncertainty of an edge in the depth map
     right, below = (ndimage.gaussian_filter(gradient, blur) for gradient in comparison.gradients)
     scaled = (comparison.scaled(scale) for scale in _SCALES)

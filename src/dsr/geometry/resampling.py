@@ -35,10 +35,7 @@ _FRAGMENTS = 1 << 21  # pairs of triangle and pixel that are rasterised at a tim
 
 
 def resize_inverse_depth(inverse: Tensor, size: tuple[int, int], jump: float = JUMP) -> Tensor:
-    """Resize inverse depth, (1, H, W) in 1/m without holes, as the module describes; its outer edges stay.
-
-    ``jump`` is ``JUMP``, or infinity to average across depth steps, too.
-    """
+    """Resize inverse depth, (1, H, W) in 1/m without holes; infinite ``jump`` averages across depth steps, too."""
     if tuple(inverse.shape[-2:]) == size:
         return inverse
     rows, row_weights = _find_taps(inverse.shape[-2], size[0], inverse)
@@ -66,10 +63,7 @@ def pad_inverse_depth(inverse: Tensor, factor: int) -> Tensor:
 
 
 def _find_taps(old: int, new: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the old pixels around each new one along an axis, the middle two beside its centre, and their weights.
-
-    Both are (new, taps) for an axis of ``old`` pixels that gets ``new`` ones.
-    """
+    """Return the old pixels around each new one, the middle two beside its centre, and weights, (new, taps) each."""
     centre = (torch.arange(new, dtype=torch.float64) + 0.5) * (old / new) - 0.5
     outside = (centre - centre.clamp(0, old - 1)).abs()
     radius = torch.where(outside > 0, outside + _BORDER_RADIUS, 1.0).clamp(min=old / new)
@@ -164,10 +158,7 @@ def source_pixels(depth: Tensor, camera: Camera, transforms: Tensor, target: Cam
 
 
 def registered_camera(camera: Camera, photo: Camera) -> Camera:
-    """Return the camera of a low-resolution map in a photo's view that keeps what another camera's map shows.
-
-    It has the photo's field of view, and pixels as fine as those of ``camera``, or as the photo's if these are coarser.
-    """
+    """Return the camera of a map with the photo's field of view, and pixels as fine as the coarser camera's."""
     scale = min(max(camera.fx / photo.fx, camera.fy / photo.fy), 1.0)
     return photo.rescale(max(round(scale * photo.width), 2), max(round(scale * photo.height), 2))
 

@@ -50,19 +50,13 @@ def depth_to_normals(depth: Tensor, rays: Tensor, dtype: torch.dtype | None = No
 
 
 def length(vectors: Tensor) -> Tensor:
-    """Return the Euclidean lengths of (..., 3, H, W) vectors, (..., 1, H, W).
-
-    Much faster on the CPU than ``torch.linalg.vector_norm`` over an axis that is not the last.
-    """
+    """Return the lengths of (..., 3, H, W) vectors, (..., 1, H, W); much faster on the CPU than ``vector_norm``."""
     x, y, z = vectors.split(1, dim=-3)
     return (x.square() + y.square() + z.square()).sqrt()
 
 
 def angle_between(first: Tensor, second: Tensor) -> Tensor:
-    """Return the angle between unit vectors, (..., 3, H, W) each, in degrees: (..., 1, H, W).
-
-    It is computed from the chord, which is precise for small angles, too.
-    """
+    """Return the angle between unit vectors, (..., 3, H, W), in degrees, (..., 1, H, W), by the precise chord."""
     return torch.rad2deg(2 * (length(first - second) / 2).clamp(max=1).asin())
 
 
@@ -79,10 +73,7 @@ def _repeat_last(values: Tensor, dim: int) -> Tensor:
 
 
 def lights(*, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
-    """Return the paper's lights e1..e4 in the camera frame, (4, 3) unit vectors that point from surface to light.
-
-    e1, e2, e3 are orthonormal, so renderings under them are the normal map in another basis; e4 is frontal.
-    """
+    """Return the paper's lights e1..e4 in the camera frame, (4, 3) unit vectors that point from surface to light."""
     return torch.tensor([light.direction for light in LIGHTS.values()], dtype=dtype, device=device)
 
 

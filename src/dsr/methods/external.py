@@ -191,10 +191,7 @@ def fit_to_map(values: Tensor, sample: DepthSample, quantity: str, fit: str, pla
 
 
 def fit_line(values: Tensor, target: Tensor, *, shift: bool = True) -> tuple[float, float]:
-    """Return the gain and shift, or 0 for it, of ``gain * values + shift`` with the least sum of absolute errors.
-
-    Reweighted least squares, which begin at the line of least squares; outliers, as at depth steps, hardly count.
-    """
+    """Return gain and shift, or 0, of the least sum of absolute errors, by reweighted least squares."""
     weight, line = torch.ones_like(values), torch.zeros(2, dtype=values.dtype)
     floor = 1e-6 * float(target.abs().median()) + torch.finfo(values.dtype).tiny
     mean = middle = values.new_zeros(())

@@ -62,10 +62,7 @@ def normalise(x: Tensor, min_max: Tensor | None = None) -> Normalised:
 
 
 def compute_min_max(x: Tensor) -> Tensor:
-    """Return the minimum and the maximum finite value of each map of (B, 1, H, W), (B, 2, 1, 1).
-
-    They are infinity and minus infinity for a map without a finite value.
-    """
+    """Return the minimum and maximum finite value of each map (B, 1, H, W), (B, 2, 1, 1), else inf and -inf."""
     invalid, dims = ~x.isfinite(), (-3, -2, -1)
     lowest = x.masked_fill(invalid, torch.inf).amin(dims, keepdim=True)
     return torch.cat((lowest, x.masked_fill(invalid, -torch.inf).amax(dims, keepdim=True)), dim=1)

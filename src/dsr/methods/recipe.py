@@ -131,10 +131,7 @@ class Recipe:
         return find_weights(self.at(factor).get("weights"), factor, self.name)
 
     def build(self, factor: float, run: Run | None = None, **decided: Any) -> Method:
-        """Build the method for a factor.
-
-        ``decided`` are arguments that the caller decides in place of the method's file, if the class names them.
-        """
+        """Build the method for a factor; ``decided`` are arguments that the caller decides, not the method's file."""
         given = {**vars(run or Run()), "scale": factor}
         known = given.pop("known")._asdict()
         if self.abilities.needs is not None:

@@ -57,10 +57,7 @@ def count_edges(first: Tensor, second: Tensor) -> Tensor:
 
 @once_per_pair
 def depth_pro_scores(pair: SurfacePair) -> dict[str, Tensor]:
-    """Return Depth Pro's scale-invariant boundary F1 and its ceiling by name, (B,) each, fractions.
-
-    The ceiling is the F1 of the truth against itself: the fraction of directions that have edges.
-    """
+    """Return Depth Pro's boundary F1, and its ceiling, the truth's own, by name, (B,) each, fractions."""
     maps, counts = known_maps(pair), []
     for dim in (-1, -2):
         size = pair.target.shape[dim] - 1
@@ -149,10 +146,7 @@ def boundary_errors(pair: SurfacePair) -> dict[str, Tensor]:
 
 @once_per_pair
 def directed_depth_error(pair: SurfacePair) -> dict[str, Tensor]:
-    """Return iBims-1's directed depth error about a plane at 3 m, three fractions of pixels, (B,) each.
-
-    They are on the right side, in front of it though the truth is not, and beyond it though the truth is not.
-    """
+    """Return iBims-1's directed depth error about a plane at 3 m: fractions right, before and beyond it, (B,) each."""
     before, truly = pair.prediction <= DDE_PLANE, pair.target <= DDE_PLANE
     parts = {"right": before == truly, "before": before & ~truly, "beyond": ~before & truly}
     return {name: masked_mean(part, pair.depth_mask).squeeze(1) for name, part in parts.items()}

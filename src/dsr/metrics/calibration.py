@@ -28,10 +28,7 @@ OFF = 0.02  # metres from which on a pixel is off
 
 
 def measured_errors(prediction: Tensor, target: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the absolute errors of depth in metres and of normals in degrees, (B, 1, H, W) each, NaN where undefined.
-
-    Prediction and target are (B, 1, H, W) orthogonal depth in metres, NaN in holes, the rays (B or 1, 3, H, W).
-    """
+    """Return the absolute errors of depth in metres and of normals in degrees, (B, 1, H, W) each, or NaN."""
     angles = angle_between(depth_to_normals(prediction, rays), depth_to_normals(target, rays))
     return (prediction - target).abs(), angles
 
@@ -47,10 +44,7 @@ def error_ratios(expected: Tensor, measured: Tensor, parts: int = 10) -> Tensor:
 
 
 def squared_error_share(expected: Tensor, measured: Tensor, kept: float = 0.8) -> Tensor:
-    """Return the fraction of the sum of squared errors that lies in the pixels with the smallest expected errors, ().
-
-    Unrelated expected errors give ``kept``, the fraction of pixels, on average.
-    """
+    """Return the fraction of the sum of squared errors in the ``kept`` pixels with the smallest expected errors, ()."""
     _, measured = _ordered(expected, measured)
     squares = measured.square()
     return squares[: round(kept * len(squares))].sum() / squares.sum()
@@ -95,10 +89,7 @@ def ause(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Tensor:
 
 
 def off_auc(expected: Tensor, measured: Tensor, threshold: float = OFF) -> Tensor:
-    """Return the area under the ROC curve of expected errors that separate pixels with large errors from the others.
-
-    It is the probability that the former have larger expected errors; equal expected errors count half.
-    """
+    """Return the area under the ROC curve of expected errors that separate pixels with large errors from the others."""
     expected, measured = _ordered(expected, measured)
     of, sizes = expected.unique_consecutive(return_inverse=True, return_counts=True)[1:]
     off = expected.new_zeros(len(sizes)).index_add(0, of, (measured > threshold).to(expected))

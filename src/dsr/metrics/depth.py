@@ -59,10 +59,7 @@ def depth_errors(pair: SurfacePair) -> dict[str, Tensor]:
 
 @once_per_pair
 def field_errors(pair: SurfacePair) -> dict[str, Tensor]:
-    """Return the errors of depth super-resolution by name, (B,) each.
-
-    RMSE and MAE are in the benchmark's unit, in which the prediction is clamped to the limits, as 8-bit levels are.
-    """
+    """Return the errors of depth super-resolution by name, (B,) each, in the benchmark's unit and its limits."""
     z, t = pair.prediction, pair.target
     mean = partial(masked_mean, mask=pair.depth_mask)  # (B, 1)
     converted = pair.unit.convert(z)

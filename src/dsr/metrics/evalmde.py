@@ -75,10 +75,7 @@ def nearest_to_centres(mask: Tensor, scale: int) -> Tensor:
 @lru_cache(maxsize=2)
 @torch.inference_mode(mode=False)  # what is kept serves gradients, too
 def sobol_pairs(height: int, width: int, device: torch.device) -> list[Tensor]:
-    """Return the pairs of normals that RelNormal compares, for each scale (2, 10^6) int32 indices into its normal map.
-
-    They are the first of an unscrambled Sobol sequence in four dimensions inside the map (position, offset), sorted.
-    """
+    """Return the pairs of normals to compare, of a Sobol sequence, for each scale (2, 10^6) int32 indices."""
     engine, found = torch.quasirandom.SobolEngine(4), []
     draws: list[Tensor] = []
     for scale in SCALES:

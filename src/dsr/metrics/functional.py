@@ -204,10 +204,7 @@ def bad_pix_d(pair: SurfacePair, threshold: float, *, relative: bool = False) ->
 
 
 def mse_v(pair: SurfacePair) -> Tensor:
-    """Return MSE_v, (B,): the mean squared difference of the unclipped renderings under e1, e2, e3 (eq. 3).
-
-    As these lights are orthonormal, this is the mean squared difference of the normal maps' three components.
-    """
+    """Return MSE_v, (B,), eq. 3: under orthonormal lights the mean squared difference of the normals' components."""
     first, second = pair.normals
     return masked_mean((first - second).square().mean(dim=1, keepdim=True), pair.normal_mask).squeeze(1)
 

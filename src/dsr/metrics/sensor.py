@@ -133,10 +133,7 @@ def board_errors(pair: SurfacePair) -> dict[str, Tensor]:
 
 
 def plane_normal(points: Tensor) -> Tensor:
-    """Return the normal of the plane through points (N, 3), (3,), of least squares along the axis that it faces most.
-
-    NaN for points in a line.
-    """
+    """Return the normal, (3,), of the least-squares plane through points (N, 3), NaN for points in a line."""
     centred = points - points.mean(dim=0)
     moments = centred.T @ centred
     others = torch.tensor([[1, 2], [0, 2], [0, 1]], device=points.device)

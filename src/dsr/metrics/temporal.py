@@ -44,10 +44,7 @@ def flicker(depths: Tensor, static: Tensor | None = None) -> Tensor:
 
 @in_own_precision
 def temporal_noise(depths: Tensor, static: Tensor | None = None) -> Tensor:
-    """Return the median over the pixels of the deviation over time whose mean is :func:`flicker`.
-
-    Pixels that never have a depth are left out; Intel's tool counts them as 0.
-    """
+    """Return the median over the pixels that ever have a depth of the deviation whose mean is :func:`flicker`."""
     return masked_median(*_spread(depths, static)).squeeze()
 
 

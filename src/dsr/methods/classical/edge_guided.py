@@ -293,10 +293,7 @@ def detect_edges(lr: Tensor, scale: int, step: float) -> Tensor:
 
 
 def find_recurring(lr: Tensor, scale: int, step: float) -> Tensor:
-    """Return pairs of patches of a map, (h, w), downsampled by ``scale``, (N, 2, PATCH, PATCH) bool.
-
-    The first of a pair has the edges of the upsampled map, the second the true ones. There is none in a map too small.
-    """
+    """Return pairs of patches of a map, (h, w), downsampled by ``scale``, found and true, (N, 2, PATCH, PATCH) bool."""
     height, width = (n - n % scale for n in lr.shape)
     if min(height, width) < max(PATCH, 2 * scale):
         return torch.zeros(0, 2, PATCH, PATCH, dtype=torch.bool, device=lr.device)
@@ -370,10 +367,7 @@ def deduplicate(patches: Tensor) -> Tensor:
 
 
 def edge_distances(patches: Tensor) -> Tensor:
-    """Return each pixel's Euclidean distance from the edges of its patch, (N, PATCH, PATCH) float32.
-
-    Infinite in a patch without an edge.
-    """
+    """Return each pixel's distance from the edges of its patch, (N, PATCH, PATCH) float32, infinite without an edge."""
     place = torch.arange(PATCH, device=patches.device)
     square = (place[:, None] - place).square().float()
     along = torch.where(patches[:, :, None], square, torch.inf).amin(dim=3)  # (N, row, column), within the row

@@ -68,10 +68,7 @@ def compute_shading(normals: Tensor, lighting: Tensor) -> Tensor:
 
 
 def fit_lighting(rgb: Tensor, albedo: Tensor, normals: Tensor, inside: Tensor) -> Tensor:
-    """Return the lighting with the least squared error in each channel, (B, C, 4) float64.
-
-    If the normals do not determine it, as on a plane, it is the one of minimum norm. ``inside`` weights the pixels.
-    """
+    """Return the lighting with the least squared error, or the one of minimum norm, (B, C, 4) float64."""
     ones = torch.ones_like(normals[:, :1])
     design = (torch.cat((normals, ones), dim=1) * inside)[:, None] * albedo[:, :, None]  # (B, C, 4, H, W)
     columns = design.flatten(3).double()

@@ -208,10 +208,7 @@ def divergence(p: Tensor) -> Tensor:
 
 
 def sum_adjacent(p: Tensor, sign: int = 1) -> Tensor:
-    """Return the sum of the values at the differences that use each pixel, (B, 2, C, H, W) -> (B, C, H, W).
-
-    At its second pixel, a value has the sign. The last column of p along u and its last row along v are ignored.
-    """
+    """Return the sum of (B, 2, C, H, W) at the differences of each pixel, by ``sign`` where it is the second one."""
     total = torch.zeros_like(p[:, 0])
     for direction, dim in ((0, -1), (1, -2)):
         count = p.shape[dim] - 1

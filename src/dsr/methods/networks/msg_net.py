@@ -170,10 +170,7 @@ class MSGNet(DisparityNetwork):
         detail_range: Tensor | None = None,
         drift: Tensor | None = None,
     ) -> Tensor:
-        """Return high-resolution disparity; see :meth:`~dsr.methods.networks.network.DisparityNetwork.upsample`.
-
-        It is (B, 1, H - 1, W - 1) for the ``hui`` variant, and can be negative.
-        """
+        """Return high-resolution disparity, see the base class; (B, 1, H - 1, W - 1) for the ``hui`` variant."""
         expect_rgb_size(rgb, disparity, self.scale)
         values, minimum, value_range = normalise(disparity, min_max)
         if self.variant == "dsr":
@@ -228,10 +225,7 @@ class MSGNet(DisparityNetwork):
         return output[..., rows, columns].mean((-2, -1), keepdim=True)
 
     def rows_seen(self, rows: int) -> int:
-        """Return how many low-resolution rows (times scale, guidance rows) the outputs 0 .. ``rows`` - 1 depend on.
-
-        A 5 x 5 convolution needs 2 more rows, and output o of a transposed one reads inputs up to (o + 2) // 2.
-        """
+        """Return how many low-resolution rows (times scale, guidance rows) the outputs 0 .. ``rows`` - 1 depend on."""
         seen = rows + 4  # reconstruction, smoothing
         for _ in self.levels:
             seen = (seen + 4 + 1) // 2 + 1  # refinement and fusion, then the transposed convolution

@@ -298,10 +298,7 @@ def split_image(
 
 
 def split_axis(size: int, tile: int, radius: int, overlap: int) -> list[AxisTile]:
-    """Split an axis of low-resolution pixels into tiles whose sizes differ by one pixel at most.
-
-    ``tile`` is their maximum size without the overlaps, which are even, and ``radius`` that of the receptive field.
-    """
+    """Split low-resolution pixels into tiles of at most ``tile`` without the overlaps, sizes alike to one pixel."""
     count = max(1, min(math.ceil(size / tile), size // max(overlap, 1)))
     edges, half, found = [round(i * size / count) for i in range(count + 1)], overlap // 2, []
     for i in range(count):

@@ -94,10 +94,7 @@ def has_weights(node: Any, scale: float) -> bool:
 
 
 def nearest_scale(trained: Collection[float], scale: float) -> float:
-    """Return the trained factor whose weights suit a factor: itself, else the smallest whole one above, or the largest.
-
-    Weights for a factor that is not whole were trained on one sensor's maps and suit no others.
-    """
+    """Return the trained factor that suits a factor: itself, else the smallest whole one above, or the largest."""
     if scale in trained:
         return scale
     whole = [each for each in trained if float(each).is_integer()]

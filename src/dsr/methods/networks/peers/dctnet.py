@@ -120,10 +120,7 @@ class DCTNet(PeerNetwork):
 
 
 def transfer_edges(depth: Tensor, guide: Tensor, weight: Tensor, strength: Tensor) -> Tensor:
-    """Return x with (1 + strength L^2) x = depth + strength L (weight L guide), L the Laplacian.
-
-    The first three are (B, C, H, W), ``strength`` (1, C, 1, 1), and x in float32 or float64.
-    """
+    """Return x with (1 + strength L^2) x = depth + strength L (weight L guide), (B, C, H, W), L the Laplacian."""
     dtype = torch.promote_types(strength.dtype, torch.float32)
     height, width = depth.shape[-2:]
     eigenvalues = laplacian_eigenvalues(height, width, strength).square()

@@ -34,10 +34,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def fold_batch_norm(tensors: dict[str, Tensor], conv: str, norm: str, eps: float = 1e-5) -> None:
-    """Merge a batch normalisation, as evaluation runs it, into the convolution with a bias before it, in place.
-
-    Nothing happens if a tensor is missing or of another shape.
-    """
+    """Merge a batch normalisation into the convolution with a bias before it, in place, if all tensors fit."""
     names = [f"{conv}.weight", f"{conv}.bias", *(f"{norm}.{part}" for part in _NORM_PARTS)]
     if any(name not in tensors for name in names):
         return
