@@ -248,10 +248,3 @@ def whole_scale(sample: DepthSample) -> int:
     if not isinstance(sample.scale, int):
         raise ValueError(f"{sample.scene}: expected a whole scale for this method, got {round_ratio(sample.scale)}")
     return sample.scale
-
-
-def expect_positive(*, or_zero: bool = False, **options: float) -> None:
-    """Raise a ValueError for the first option that is not a positive finite number, nor 0 if that is allowed."""
-    for name, value in options.items():
-        if not (0 < value < float("inf") or (or_zero and value == 0)):
-            raise ValueError(f"{name}: expected {'0 or ' if or_zero else ''}a positive number, got {value}")

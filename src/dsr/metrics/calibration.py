@@ -150,12 +150,11 @@ def _per_image(
 
 
 _of_depth = partial(of_parts, "Calibration_", depth_calibration, depth_mask, min_size=1, stated="depth_error")
+_of_normals = column("AUSE", f"normals, {STEPS} steps", 1, 3)
 _covered = partial(Metric, min_size=1, stated="depth_error", regional=True, whole=True)
 METRICS: tuple[Metric, ...] = (
     *_of_depth({"ENCE": column("ENCE", "depth, %", 1e2), "AUSE_d": column("AUSE", f"depth, {STEPS} steps", 1, 3)}),
-    Metric(
-        "Calibration_AUSE_v", ause_v, normal_mask, column("AUSE", f"normals, {STEPS} steps", 1, 3), stated="angle_error"
-    ),
+    Metric("Calibration_AUSE_v", ause_v, normal_mask, _of_normals, stated="angle_error"),
     *_of_depth({"AUC_20mm": column("AUC", "off by 20 mm", 1, 3, higher_is_better=True)}, unit="cm"),
     *_of_depth({"stated": MetricFormat("Stated", "of true error", position=None)}),
     *_of_depth({"factor": column("Stated off", "factor", 1, 2)}),

@@ -29,6 +29,7 @@ def _bad_pixels(percent: int, unit: str, shown: str, position: int | None = None
 
 _by_light = partial(Metric, per_light=True)
 _visual = partial(MetricFormat, unit="1/1000", factor=1e3, digits=0)
+_bump = MetricFormat("Bump_d", digits=2, position=6)
 _windows, _curvatures = attrgetter("ssim_mask"), attrgetter("bumpiness_mask")
 # the paper's metrics in the order of scores.csv; those with a position are the columns of its tables
 METRICS: tuple[Metric, ...] = (
@@ -48,9 +49,7 @@ METRICS: tuple[Metric, ...] = (
     _by_light("LPIPS_v", lpips_v, normal_mask, _visual("LPIPS_v", position=5), min_size=MIN_SIZE, perceptual=True),
     Metric("RMSE_v", functional.rmse_v, normal_mask, _visual("RMSE_v", position=7)),
     _by_light("RMSE_v1", functional.rmse_v1, normal_mask, _visual("RMSE_v1", position=None)),
-    Metric(
-        "Bumpiness_d", functional.bumpiness_d, _curvatures, MetricFormat("Bump_d", digits=2, position=6), min_size=3
-    ),
+    Metric("Bumpiness_d", functional.bumpiness_d, _curvatures, _bump, min_size=3),
 )
 
 

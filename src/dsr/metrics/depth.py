@@ -191,19 +191,16 @@ NORMALS = (
     *of_parts("Normal_", normal_errors, normal_mask, _normal),
     *of_parts("Normal_", normal_errors, true_normal_mask, _normals_covered, regional=True, whole=True),
 )
+_clouds = {
+    "chamfer": column("Chamfer", "mm", 1e3, 2),
+    "F_1cm": _fraction("F at 1 cm", "%", digits=2),
+    "F_5cm": _fraction("F at 5 cm", "%", digits=2),
+}
+_points_covered = _fraction("Covered", "points, %")
 _of_points = partial(of_parts, "Points_", point_errors, min_size=1, unit="cm", whole=True)
 POINTS = (
     # not of regions: the outlines of a region's objects are edges of what lies outside
     *_of_points(depth_mask, {"flying": column("Flying", "1 % of depth, %", 1e2, 2)}, regional=False),
-    *_of_points(
-        target_mask,
-        {
-            "chamfer": column("Chamfer", "mm", 1e3, 2),
-            "F_1cm": _fraction("F at 1 cm", "%", digits=2),
-            "F_5cm": _fraction("F at 5 cm", "%", digits=2),
-        },
-    ),
-    Metric(
-        "Points_covered", covered, target_mask, _fraction("Covered", "points, %"), min_size=1, unit="cm", whole=True
-    ),
+    *_of_points(target_mask, _clouds),
+    Metric("Points_covered", covered, target_mask, _points_covered, min_size=1, unit="cm", whole=True),
 )

@@ -147,31 +147,19 @@ def plane_normal(points: Tensor) -> Tensor:
     return normal / normal.norm()
 
 
+_dssim = column("DSSIM_v", "sensor, 1/1000", 1e3, 0)
 _errors = partial(of_parts, "Sensor_", sensor_errors, whole=True)
 SENSOR: tuple[Metric, ...] = (
     *_errors(_scored, {"RMSE_v": column("RMSE_v", "sensor, 1/1000", 1e3, 0)}),
-    Metric(
-        "Sensor_DSSIM_v",
-        dssim_v,
-        _scored,
-        column("DSSIM_v", "sensor, 1/1000", 1e3, 0),
-        per_light=True,
-        min_size=SSIM_WINDOW,
-        whole=True,
-    ),
+    Metric("Sensor_DSSIM_v", dssim_v, _scored, _dssim, per_light=True, min_size=SSIM_WINDOW, whole=True),
     *_errors(_scored, {"angle_mean": column("Angle", "mean, deg"), "angle_median": column("Angle", "median, deg")}),
     *_errors(_inner, {"covered": column("Covered", "%", 1e2, higher_is_better=True)}),
     *_errors(_scored, {"offset": column("Offset", "mm", 1e3, 2), "RMSE_d": column("RMSE_d", "sensor, mm", 1e3, 2)}),
 )
+_board_covered = {"covered": column("Covered", "plane, %", 1e2, higher_is_better=True)}
 _board = partial(of_parts, "Plane_", board_errors)
 PLANE: tuple[Metric, ...] = (
     *_board(depth_mask, {"std": column("Std", "plane, mm", 1e3, 2)}, unit="cm"),
     *_board(depth_mask, {"angle": column("Angle", "plane, central, deg")}, min_size=3),
-    *_board(
-        target_mask,
-        {"covered": column("Covered", "plane, %", 1e2, higher_is_better=True)},
-        unit="cm",
-        regional=True,
-        whole=True,
-    ),
+    *_board(target_mask, _board_covered, unit="cm", regional=True, whole=True),
 )

@@ -25,7 +25,7 @@ from dsr.metrics.functional import SurfacePair, masked_mean, mse_v
 from dsr.metrics.losses import MSE_V, VisualLoss, VisualLossName, l1, lap1, make_visual_loss, match_weight, mse
 from dsr.training.degradation import Batch
 from dsr.utils.compute_device import in_own_precision
-from dsr.utils.guards import expect_one_of
+from dsr.utils.guards import expect_one_of, expect_positive
 
 DepthLoss = Literal["lap1", "l1", "mse"]
 _TILT = math.asin(5 / 255)  # 1.1 degrees: changes a rendering under grazing light by 5 of 255, as for BadPix_v(5)
@@ -93,8 +93,7 @@ class DepthObjective(Objective):
 
     def __post_init__(self) -> None:
         expect_one_of("depth_loss", self.depth_loss, _DEPTH_LOSSES)
-        if not 0 <= self.shading < math.inf:
-            raise ValueError(f"shading: expected 0 or a positive number, got {self.shading}")
+        expect_positive(or_zero=True, shading=self.shading)
         if self.w != "auto" and not 0 <= self.w < math.inf:
             raise ValueError(f"w: expected auto or a number, 0 or more, got {self.w}")
 

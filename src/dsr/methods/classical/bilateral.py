@@ -21,10 +21,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.methods.base import Abilities, Cost, expect_positive
+from dsr.methods.base import Abilities, Cost
 from dsr.methods.classical.guided_filter import Guided, GuidedMethod, expect_window
 from dsr.methods.images import inpaint
 from dsr.sample import DepthSample
+from dsr.utils.guards import expect_positive
 from dsr.utils.progress import Steps
 
 _NO_WEIGHT = 10.0  # standard deviations of depth at which a pixel has no weight: exp(-50)

@@ -25,10 +25,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import from_range
-from dsr.methods.base import Abilities, Cost, Method, NoSolutionError, expect_positive, whole_scale
+from dsr.methods.base import Abilities, Cost, Method, NoSolutionError, whole_scale
 from dsr.methods.classical.guided_filter import BEYOND, estimate_slopes, expect_window
 from dsr.methods.images import box_mean, extend_linearly, inpaint, repeat_blocks, upsample_linear_border
 from dsr.sample import DepthSample
+from dsr.utils.guards import expect_positive
 from dsr.utils.progress import Steps, ignore, part_of
 
 # rows and columns from a pixel to its neighbours, the nearest first

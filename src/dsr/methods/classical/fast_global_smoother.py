@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.base import expect_positive
 from dsr.methods.classical.guided_filter import Guided, GuidedMethod
+from dsr.utils.guards import expect_positive
 
 # minimum smoothed confidence; below it digits are lost, and the result is the nearest low-resolution value
 _LEAST = 1e-200

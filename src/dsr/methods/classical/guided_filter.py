@@ -24,9 +24,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import from_range
-from dsr.methods.base import Abilities, Cost, Method, expect_positive
+from dsr.methods.base import Abilities, Cost, Method
 from dsr.methods.images import inpaint, lr_coordinates
 from dsr.sample import DepthSample
+from dsr.utils.guards import expect_positive
 from dsr.utils.progress import Steps
 
 _WIDEST = 1024  # largest radius or width of a filter, in low-resolution pixels

@@ -32,11 +32,11 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.surface import length
-from dsr.methods.base import Abilities, Cost, Method, expect_positive, whole_scale
+from dsr.methods.base import Abilities, Cost, Method, whole_scale
 from dsr.methods.images import box_mean, inpaint, repeat_blocks, upsample_linear_border
 from dsr.sample import DepthSample
 from dsr.utils.decoding import decode_pixels
-from dsr.utils.guards import MOST_FILE, pixels_beside, read_limited
+from dsr.utils.guards import MOST_FILE, expect_positive, pixels_beside, read_limited
 from dsr.utils.progress import Steps
 
 _TINY = 1e-12  # minimum length of m, which avoids division by 0

@@ -27,7 +27,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import from_range
-from dsr.methods.base import Abilities, Cost, Method, expect_positive, whole_scale
+from dsr.methods.base import Abilities, Cost, Method, whole_scale
 from dsr.methods.images import (
     box_mean,
     estimate_sensor_noise,
@@ -38,6 +38,7 @@ from dsr.methods.images import (
     upsample_linear_border,
 )
 from dsr.sample import DepthSample
+from dsr.utils.guards import expect_positive
 from dsr.utils.progress import Steps, ignore
 
 _CHECK_EVERY = 50  # iterations between two checks of how far the map has moved

@@ -32,13 +32,14 @@ from torch.utils.data import DataLoader
 
 from dsr.degradation.downsampling import Downsampling, downsample_depth, scene_generator
 from dsr.geometry.surface import comparison, depth_to_normals
-from dsr.methods.base import WORKSPACE, Abilities, Cost, Method, expect_positive, whole_scale
+from dsr.methods.base import WORKSPACE, Abilities, Cost, Method, whole_scale
 from dsr.methods.images import compute_min_max, estimate_noise, grey, mean3x3, normal_noise_deg
 from dsr.methods.networks.network import DTYPES, Precision
 from dsr.metrics.classes import compute_means, in_table_units
 from dsr.metrics.functional import SurfacePair, rmse_v
 from dsr.metrics.losses import VisualLossName, lap1, make_visual_loss, match_weight, mse
 from dsr.sample import DepthSample
+from dsr.utils.guards import expect_positive
 from dsr.utils.lightning import ScoreTables, StepProgress, fit, make_trainer
 from dsr.utils.progress import Progress, Steps, StepsProgress
 from dsr.utils.runs_table import list_run
