@@ -75,8 +75,8 @@ class Shadows:
 
 
 def occluded(disparity: Tensor) -> Tensor:
-    """Return the mask of pixels, (..., h, w), that a nearer one covers in a second image, to the left if negative."""
-    if bool((disparity < 0).any()):
+    """Return the mask of the pixels, (..., h, w), that a nearer one covers in a second image, by their disparity."""
+    if bool((disparity < 0).any()):  # the second camera is to the left
         return occluded(-disparity.flip(-1)).flip(-1)
     seen_at = torch.arange(disparity.shape[-1], device=disparity.device) - disparity  # the column in the second image
     nearest = seen_at.nan_to_num(torch.inf).flip(-1).cummin(dim=-1).values.flip(-1)

@@ -13,10 +13,9 @@ with theta in all terms except for the data term, plus penalty / 2 * (|(p, q, z)
 steps lower it: the albedo by region fusion (:func:`fuse`), the lighting by least squares, theta by Levenberg and
 Marquardt's method, z by conjugate gradients.
 
-What differs, besides the weights (the original's: data 0.0015, area 1e-7, boundary 0.5 at x4 with a focal length of 500
-pixels): each channel has its own light; the penalty of the copy of z is weighted by 1 / scale^2; theta's 3 x 3 systems
-are solved in closed form, not by BFGS; it starts from the bicubic map, which stays unchanged outside the foreground.
-Holes have no data term.
+What differs, besides what docs/measurements/methods.md says and the weights (the original's: data 0.0015, area 1e-7,
+boundary 0.5 at x4 with a focal length of 500 pixels): the penalty of the copy of z is weighted by 1 / scale^2; it
+starts from the bicubic map, which stays unchanged outside the foreground. Holes have no data term.
 """
 
 from __future__ import annotations
@@ -68,7 +67,7 @@ def compute_shading(normals: Tensor, lighting: Tensor) -> Tensor:
 
 
 def fit_lighting(rgb: Tensor, albedo: Tensor, normals: Tensor, inside: Tensor) -> Tensor:
-    """Return the lighting with the least squared error, or the one of minimum norm, (B, C, 4) float64."""
+    """Return the lighting with the least squared error, of several the one of minimum norm, (B, C, 4) float64."""
     ones = torch.ones_like(normals[:, :1])
     design = (torch.cat((normals, ones), dim=1) * inside)[:, None] * albedo[:, :, None]  # (B, C, 4, H, W)
     columns = design.flatten(3).double()

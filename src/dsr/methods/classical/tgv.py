@@ -209,7 +209,7 @@ def divergence(p: Tensor) -> Tensor:
 
 
 def sum_adjacent(p: Tensor, sign: int = 1) -> Tensor:
-    """Return the sum of (B, 2, C, H, W) at the differences of each pixel, by ``sign`` where it is the second one."""
+    """Return at each pixel the sum of p for the differences that use it, (B, C, H, W), by ``sign`` at the second."""
     total = torch.zeros_like(p[:, 0])
     for direction, dim in ((0, -1), (1, -2)):
         count = p.shape[dim] - 1

@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from dsr.methods.base import Cost
 from dsr.methods.images import dct2, idct2, laplacian_eigenvalues, normalise_imagenet
-from dsr.methods.networks.peers.peer_network import PeerNetwork
+from dsr.methods.networks.peers import PeerNetwork
 
 FEATURES = 64
 _LAYERS = 4

@@ -21,7 +21,7 @@ from torch.nn import functional
 from dsr.degradation.downsampling import cubic_kernel
 from dsr.methods.base import Cost
 from dsr.methods.images import grey
-from dsr.methods.networks.peers.peer_network import SWAPPED_LUMA, PeerNetwork, fold_batch_norm
+from dsr.methods.networks.peers import SWAPPED_LUMA, PeerNetwork, fold_batch_norm
 
 _WIDTH, _DEPTH, _SLOPE = 64, 10, 0.1
 _CUBIC = -0.75  # parameter of the cubic kernel

@@ -22,10 +22,10 @@ from dsr.geometry.camera import RANGE_TYPES, RangeType, from_range, to_range
 from dsr.methods.base import Abilities, Method
 from dsr.methods.images import compute_min_max, inpaint, normalise, pad_to_multiple
 from dsr.methods.networks.network import DTYPES, Precision, blend_tiles, split_image
+from dsr.methods.networks.peers import PeerNetwork, load_peer
 from dsr.methods.networks.peers.dctnet import DCTNet
 from dsr.methods.networks.peers.dornet import DORNet
 from dsr.methods.networks.peers.local_filters import FDKN, SVLRM
-from dsr.methods.networks.peers.peer_network import PeerNetwork, load_peer
 from dsr.methods.networks.peers.pgsr import PGSR
 from dsr.methods.networks.weight_files import nearest_scale
 from dsr.sample import DepthSample

@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from dsr.methods.base import Cost
 from dsr.methods.images import grey, normalise_imagenet
-from dsr.methods.networks.peers.peer_network import SWAPPED_LUMA, PeerNetwork, ResidualGroup, conv3x3, fold_batch_norm
+from dsr.methods.networks.peers import SWAPPED_LUMA, PeerNetwork, ResidualGroup, conv3x3, fold_batch_norm
 
 _FACTOR, _WIDTH, _SHARED, _LAST = 4, 32, 16, 64
 _SQUEEZED = 2
