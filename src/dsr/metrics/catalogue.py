@@ -129,8 +129,7 @@ def score_image(
         stated = {"depth_error": errors[0][at], "angle_error": errors[1][at]} if errors else {}
         return SurfacePair(*parts, unit=unit, regions=inside, image_dtype=torch.float32, **stated)
 
-    # Rows and columns at the border without any predicted pixel, which MSG's published networks leave out, are cut off,
-    # except for metrics of the whole image; the valid fractions still refer to the complete map.
+    # Rows and columns at the border without any predicted pixel, which MSG's published networks leave out, are cut off.
     whole = inner = pair_of()
     valid = prediction.isfinite()[0]
     if valid.any():

@@ -35,8 +35,7 @@ _NO_WEIGHT = 10.0  # standard deviations of depth at which a pixel has no weight
 class Bilateral(GuidedMethod):
     """The bilateral filter of the low-resolution depth, and its interpolation where the scale is above 1.
 
-    The defaults suit structured-light and time-of-flight cameras at 0.5 to 2 m, whose noise is a few millimetres. Noise
-    grows with distance: a larger ``sigma_depth`` suits maps of rooms.
+    The defaults suit depth cameras at 0.5 to 2 m; noise grows with distance.
 
     Args:
         window: diameter of the window in low-resolution pixels.

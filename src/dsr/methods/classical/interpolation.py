@@ -31,9 +31,8 @@ class Interpolation(Method):
     """Spline interpolation of low-resolution perspective depth, without a guide.
 
     ``bicubic`` is the interpolating cubic spline; ``clough_tocher`` is the smooth piecewise cubic surface over
-    triangles, which gives the scores of the "Bicubic" of Voynov et al. 2019. Both repeat the outermost
-    pixels beyond the border. Pixels are matched through the cameras, so that the pixel centres of each downsampling
-    model are respected.
+    triangles, which gives the scores of the "Bicubic" of Voynov et al. 2019. Both repeat the outermost pixels beyond
+    the border. Pixels are matched through the cameras.
 
     Args:
         order: ``nearest``, ``bilinear``, ``bicubic`` or ``clough_tocher``.

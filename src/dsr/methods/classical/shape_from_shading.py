@@ -93,8 +93,8 @@ class ShadingProblem(NamedTuple):
 class Slopes:
     """The linear operator z -> (fx dz/du, fy dz/dv, z) / unit, and its adjoint.
 
-    Differences are forward between pixels inside the mask, backward where there is no next pixel, and 0 where there is
-    neither. Without a mask, these are the differences that :func:`dsr.geometry.surface.depth_to_normals` takes.
+    Differences are forward between pixels inside the mask, backward where there is no next pixel, else 0, without a
+    mask those of :func:`dsr.geometry.surface.depth_to_normals`.
     """
 
     def __init__(self, problem: ShadingProblem) -> None:
@@ -305,8 +305,7 @@ def conjugate_gradients(
 class ShapeFromShading(Method):
     """Variational super-resolution from shading.
 
-    Holes of the input are inpainted. Memory: about 130 float64 maps of the image's size. The low-resolution map is
-    assumed to hold block means of depth.
+    Holes of the input are inpainted. The low-resolution map is assumed to hold block means of depth.
 
     Args:
         iterations: maximum number of iterations.

@@ -73,8 +73,7 @@ class Solution(NamedTuple):
 class TotalGeneralisedVariation(Method):
     """TGV-guided upsampling.
 
-    Holes of the input are inpainted. Memory: about 90 float64 maps of the image's size, 180 MB for 512 x 512. The
-    low-resolution map is assumed to hold block means of disparity, whatever the downsampling model was.
+    Holes of the input are inpainted. The low-resolution map is assumed to hold block means of disparity.
 
     Args:
         iterations: maximum number of iterations.

@@ -296,9 +296,8 @@ def _numbers(count: int) -> Any:
 class SkipNet(nn.Module):
     """An hourglass with narrow skip connections, of given channels at each level, full resolution first.
 
-    In the encoder, each level halves the resolution by a strided 3 x 3 convolution, followed by another one. In the
-    decoder, each level doubles it bilinearly, concatenates the skip connection and applies a 3 x 3 and a 1 x 1
-    convolution. Batch normalisation over the image and a leaky ReLU follow every convolution.
+    In the decoder, each level doubles the resolution bilinearly, concatenates the skip connection and applies a 3 x 3
+    and a 1 x 1 convolution. Batch normalisation over the image and a leaky ReLU follow every convolution.
     """
 
     def __init__(self, inputs: int, outputs: int, widths: Sequence[int], skips: Sequence[int]) -> None:

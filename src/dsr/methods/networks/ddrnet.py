@@ -29,8 +29,6 @@ _UPSAMPLING = 4  # receptive-field radius of the upsampling in low-resolution pi
 class DDRNet(NormalisedNetwork):
     """The network.
 
-    Memory: about 1300 bytes for each pixel of the photo, or of a window.
-
     Args:
         scale: upsampling factor, 2, 4, 8 or 16.
         denoising: channels of the first layer of the denoising network.

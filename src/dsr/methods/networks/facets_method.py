@@ -36,8 +36,7 @@ SPECIAL: Mapping[tuple[Kernel | None, Edges], tuple[Literal["clean", "soft"], fl
     {("box", "sharp"): ("clean", 0.85), ("bicubic", "soft"): ("soft", CAUTION)}
 )
 # Relative error of depth in holes that the network does not expect, per degree from the nearest measured pixel. On
-# Middlebury 2014 and ICL-NUIM with holes cut into them it expects 2 % everywhere, and depth is off by 3 % at 0.5 to 1
-# degree and by 4 % at 1 to 3 degrees.
+# Middlebury 2014 and ICL-NUIM with holes cut into them it expects 2 %, and depth is off by 4 % at 1 to 3 degrees.
 _PER_DEGREE = 0.012
 _ROUNDED = 16  # a map with fewer different values than one per so many pixels may be a rounded one
 # Share of a level's borders that it has at least with the next nearer and with the next farther level, largest ratio of

@@ -175,8 +175,6 @@ def expect_rgb_size(rgb: Tensor, values_lr: Tensor, scale: int) -> None:
 class NetworkUpsampler(Method):
     """A method that is a trained network.
 
-    The memory is about 40 bytes per pixel of the image, and 700 to 1300 bytes per pixel of a tile's window.
-
     Args:
         net: the network; it is copied.
         precision: dtype of the convolutions; all other computations use the depth's dtype.

@@ -125,13 +125,12 @@ def _apply(function: type[torch.autograd.Function], *arguments: Any) -> Tensor:
 class UnrolledHuber(nn.Module):
     """A fixed number of iterations with learned parameters, stored as logarithms so that they are positive.
 
-    The first step sizes are those with which the iteration converges (Chambolle and Pock 2011, algorithm 3); the norm
-    of K is at most 2 sqrt(N), because that of the differences along each of the N offsets is at most 2.
+    The first step sizes are those with which the iteration converges (Chambolle and Pock 2011, algorithm 3).
     """
 
     def __init__(self, window: int = 5, iterations: int = 10, data: float = 10.0, huber: float = 1.0) -> None:
         super().__init__()
-        norm = 2 * math.sqrt(len(half_window(window)))
+        norm = 2 * math.sqrt(len(half_window(window)))  # of the differences, at most: 2 along each offset
         if iterations < 1:
             raise ValueError(f"iterations: expected at least 1, got {iterations}")
         self.window = window
@@ -163,8 +162,6 @@ class UnrolledHuber(nn.Module):
 
 class PrimalDualNetwork(NormalisedNetwork):
     """The network.
-
-    Memory: about 900 bytes for each pixel of the photo, or of a window.
 
     Args:
         scale: upsampling factor, 2, 4, 8 or 16.

@@ -26,10 +26,7 @@ _STAGES = 4
 
 
 class SparseToDense(NormalisedNetwork):
-    """The network.
-
-    An image is processed as a whole, because the receptive field is wider than most images, in about 150 bytes for each
-    pixel of the photo.
+    """The network, which processes an image as a whole: the receptive field is wider than most images.
 
     Args:
         scale: upsampling factor, 2, 4, 8 or 16.

@@ -78,8 +78,7 @@ class CoupledLayer(nn.Module):
 class DCTNet(PeerNetwork):
     """DCTNet with its authors' sizes: 64 features, 4 layers, 0.48 million parameters.
 
-    The attention and the cosine transform see the whole image, so there are no tiles: large images need about 1.6 kB
-    of memory per pixel.
+    The attention and the cosine transform see the whole image, so there are no tiles.
     """
 
     title = "DCTNet"

@@ -44,8 +44,8 @@ _OVERLAP = 16  # of neighbouring tiles in pixels
 class Peer(Method):
     """A method that is a published network; it takes maps of any ratio, as the network works at the photo's size.
 
-    At a whole factor that the network was trained for, the file must be for that factor. At any other factor, such as a
-    sensor's 8/3, any of its files may be taken.
+    At a whole factor that the network was trained for, the file must be for that factor; at another one, any may be
+    taken.
 
     Args:
         peer: name of the network, a key of ``PEERS``; or a network, which is copied, in place of a file.

@@ -34,8 +34,7 @@ _UNUSED = re.compile(r"^(PAI_\d\.(upconv\d|fusion2Depth)|conv_(depth|rgb)_mappin
 class PGSR(PeerNetwork):
     """PGSR with its authors' sizes: 32 features, 0.73 million parameters.
 
-    Its attention averages over the whole image, and its offsets are fractions of the image's size, so large images are
-    not processed in tiles. Only the last layers, which need most of the memory, are computed in strips.
+    Its attention averages over the whole image, so there are no tiles. Only the last layers are computed in strips.
     """
 
     title = "PGSR"
