@@ -188,7 +188,15 @@ def _describe_noise(given: Tensor, answer: Answer) -> MapNoise:
     error = (error - (error * known).sum() / count) * known
     variance = error.square().sum() / count
     depth = given[given.isfinite()].median().reciprocal()
-    return MapNoise(float(variance.sqrt() * depth), _extent(error, known, float(variance)), float(depth))
+    before, extent = 1.0, 2.0 * 16  # the full width at half maximum of the correlation of neighbours, in pixels
+    for step in range(1, min(16, error.shape[-1])):
+        both = (known[..., step:] * known[..., :-step]).sum().clamp(min=1)
+        now = float((error[..., step:] * error[..., :-step]).sum() / both) / max(float(variance), 1e-20)
+        if now < 0.5:
+            extent = max(1.0, 2 * (step - 1 + (before - 0.5) / max(before - now, 1e-6)))
+            break
+        before = now
+    return MapNoise(float(variance.sqrt() * depth), extent, float(depth))
 
 
 def _rounding(inverse: Tensor, focal: float) -> tuple[Tensor, Tensor]:
@@ -223,18 +231,6 @@ def _rounding(inverse: Tensor, focal: float) -> tuple[Tensor, Tensor]:
     flat = known & (low == high)
     away = torch.stack([distance_to_known(each) for each in ~flat])
     return torch.where(flat, relative, 0), torch.where(flat, torch.atan(focal * relative / (away + 1)), 0)
-
-
-def _extent(error: Tensor, known: Tensor, variance: float) -> float:
-    """Return the full width at half maximum of the correlation of neighbours, in pixels, 1 for white noise."""
-    before = 1.0
-    for step in range(1, min(16, error.shape[-1])):
-        both = (known[..., step:] * known[..., :-step]).sum().clamp(min=1)
-        now = float((error[..., step:] * error[..., :-step]).sum() / both) / max(variance, 1e-20)
-        if now < 0.5:
-            return max(1.0, 2 * (step - 1 + (before - 0.5) / max(before - now, 1e-6)))
-        before = now
-    return 2.0 * 16
 
 
 def _resize(x: Tensor, size: tuple[int, int]) -> Tensor:
