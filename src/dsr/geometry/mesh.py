@@ -123,10 +123,9 @@ def _faces(inverse: np.ndarray, allowed: np.ndarray | None) -> tuple[np.ndarray,
 def _join(inverse: np.ndarray, whole: np.ndarray, tolerance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Join the pixels of inverse depth, (H, W) with NaN in holes, by triangles of up to 64 x 64 pixels.
 
-    ``whole``, (H - 1, W - 1), tells which squares of four pixels are one surface; the others keep all their pixels.
-    Leaving out a pixel may change the inverse depth there by ``tolerance``, (H, W), at each halving, NaN for not at
-    all: up to 2 % of the pixels differ by more, about twice as much at most. Returns which squares are left for two
-    triangles each, and all other triangles, (M, 3) indices, counterclockwise as the camera sees them.
+    ``whole``, (H - 1, W - 1), tells which squares of four pixels are one surface. Leaving out a pixel may change the
+    inverse depth there by ``tolerance``, (H, W), at each halving, NaN for not at all. Returns which squares are left
+    for two triangles each, and all other triangles, (M, 3) indices.
     """
     height, width = whole.shape
     side = 1 << _LEVELS
@@ -234,10 +233,7 @@ def _connected(inverse: np.ndarray) -> np.ndarray:
 
 
 def simplify(mesh: Mesh, most: int, camera: Camera) -> Mesh:
-    """Return a mesh of at most ``most`` triangles by quadric decimation, or a few more where edges cannot collapse.
-
-    Memory: about 300 bytes per triangle of ``mesh``; time: about a second per million. The camera is that of the map.
-    """
+    """Return a mesh of at most ``most`` triangles by quadric decimation, or a few more where edges cannot collapse."""
     if len(mesh.faces) <= most:
         return mesh
     library = importlib.import_module("fast_simplification")

@@ -91,10 +91,7 @@ class InverseVotes(NamedTuple):
 
 
 def range_votes(values: Array, camera: Camera, step: float = 0.0) -> RangeVotes:
-    """Count the planar windows of a map that support each range type, by their exponents k.
-
-    The values are (H, W), positive, in any unit, NaN in holes; ``step`` is their rounding step as a fraction of them.
-    """
+    """Count the planar windows of a map, (H, W) positive, by range type; ``step`` is its values' relative step."""
     windows = _windows(values, camera)
     if not windows.inverse.size:
         return RangeVotes(0, 0, 0, 0)
@@ -113,10 +110,7 @@ def range_votes(values: Array, camera: Camera, step: float = 0.0) -> RangeVotes:
 
 
 def inverse_votes(values: Array) -> InverseVotes:
-    """Count in which windows of a map, (H, W) positive, NaN in holes, its values are linear, or their reciprocals.
-
-    Of a large map, every n-th pixel is read.
-    """
+    """Count in which windows of a map, (H, W) positive, NaN in holes, its values are linear, or their reciprocals."""
     values, camera = thinned(values, Camera.from_fov(ASSUMED_FOV, values.shape[1], values.shape[0]))
     deviations, planar = [], []
     with np.errstate(over="ignore", divide="ignore"):

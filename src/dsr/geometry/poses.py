@@ -178,10 +178,7 @@ def sample(count: int) -> list[tuple[int, ...]]:
 
 
 def check_poses(count: int, load: Callable[[int], PosedMap | None]) -> Assumption | None:
-    """Compare some frames of a sequence with each other; see :func:`find_fault`.
-
-    ``load`` returns the frame of a number; None for one that cannot be read, or has no pose.
-    """
+    """Compare some frames of a sequence by :func:`find_fault`; ``load`` returns one, or None if it has no pose."""
     return find_fault(filter(None, map(load, group)) for group in sample(count))
 
 
@@ -226,10 +223,7 @@ def _compare(frame: _Reduced, other: _Reduced) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_fault(groups: Iterable[Iterable[PosedMap]]) -> Assumption | None:
-    """Return a warning where frames of a group disagree under the poses as given.
-
-    None where they agree, or show too little. A pair of frames counts as much as they disagree without motion.
-    """
+    """Return a warning where frames of a group disagree under the poses as given; None if they show too little."""
     pairs = [pair for group in groups for pair in itertools.combinations(map(_prepare, group), 2)]
     # (pairs, readings + 1) each: under all readings and, last, without motion
     overlap, agreed = np.reshape([_compare(*pair) for pair in pairs], (len(pairs), 2, len(READINGS) + 1)).swapaxes(0, 1)
@@ -238,7 +232,7 @@ def find_fault(groups: Iterable[Iterable[PosedMap]]) -> Assumption | None:
     seen = overlap >= _OVERLAP
     without = agreed[:, -1:]
     given = np.where(seen[:, :1], agreed[:, :1], without)
-    weight = seen * (1 - without)  # (pairs, readings + 1)
+    weight = seen * (1 - without)  # (pairs, readings + 1): as much as a pair disagrees without motion
     total = weight.sum(0)
     means = [(weight * each).sum(0) / np.maximum(total, 1e-9) for each in (agreed, given, without)]
     gain = means[0] - np.maximum(means[1], means[2])

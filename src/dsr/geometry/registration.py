@@ -65,28 +65,22 @@ class Displacement:
 
 
 class Edges(NamedTuple):
-    """Edges of a depth map in pixels of a photo: rows and columns, (2, N), of pixels where its gradients are read.
+    """Edges of a depth map in pixels of a photo: rows and columns, (2, N), of pixels where its gradients are read."""
 
-    ``right`` (``below``) has the pixels whose right (lower) neighbour has another depth.
-    """
-
-    right: Array
-    below: Array
+    right: Array  # the pixels whose right neighbour has another depth
+    below: Array  # likewise the lower one
 
 
 @dataclass(frozen=True)
 class _Comparison:
-    """Depth edges, the tile of each, and a photo's gradients at one working size, (height, width).
-
-    ``pixel`` is the width of a pixel of the depth map in working pixels, ``radius`` the largest shift.
-    """
+    """Depth edges, the tile of each, and a photo's gradients at one working size, (height, width)."""
 
     edges: Edges
     tiles: np.ndarray
     gradients: Gradients
     size: tuple[int, int]
-    pixel: int
-    radius: int
+    pixel: int  # width of a pixel of the depth map in working pixels
+    radius: int  # largest shift
 
     def scaled(self, scale: float) -> Edges:
         """Return the edges scaled about the middle."""

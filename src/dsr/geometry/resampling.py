@@ -112,10 +112,7 @@ def _along(x: Tensor, bend: Tensor, indices: Tensor, weights: Tensor, dim: int) 
 
 
 class _Corners(NamedTuple):
-    """Triangles: their corners' places in pixels and inverse depth, (N, 3) each, and the numbers of their maps, (N,).
-
-    Seen from the front, the corners are in clockwise order on the screen, where y points down.
-    """
+    """Triangles: their corners' places and inverse depth, (N, 3) each, clockwise as seen, and their maps, (N,)."""
 
     u: Tensor
     v: Tensor

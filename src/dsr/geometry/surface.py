@@ -88,10 +88,7 @@ def render(normals: Tensor) -> Tensor:
 
 
 def render_for_viewing(normals: Tensor) -> Tensor:
-    """Return a rendering for pictures, (B, 1, H, W) in (0, 1), in which floors and ceilings keep tone.
-
-    The cosine to the light is mapped to a brightness over its whole range from -1 to 1, as in "half Lambert" shading.
-    """
+    """Return a rendering for pictures, (B, 1, H, W) in (0, 1), in which floors keep tone, as in "half Lambert"."""
     low, high, exponent = VIEWING_TONES
     cosine = shade(normals, torch.tensor([VIEWING_LIGHT], dtype=normals.dtype, device=normals.device))
     return low + (high - low) * ((1 + cosine) / 2).clamp(0, 1) ** exponent

@@ -88,10 +88,7 @@ class Outliers(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """A result with its expected errors, (1, H, W) each, None for a method that does not predict them.
-
-    Pixels that a method leaves out on purpose have errors and no depth.
-    """
+    """A result with its expected errors, (1, H, W), also where a method leaves out depth; None if not predicted."""
 
     depth: Tensor  # orthogonal, in metres, NaN where missing
     depth_error: Tensor | None = None  # expected absolute error in metres

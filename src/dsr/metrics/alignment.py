@@ -70,10 +70,7 @@ def align_map(depth: Tensor, truth: Tensor | None, how: str) -> Tensor:
 def align_errors(
     errors: tuple[Tensor, Tensor] | None, depth: Tensor, aligned: Tensor, how: str
 ) -> tuple[Tensor, Tensor] | None:
-    """Return the expected errors of depth and normals of an aligned prediction.
-
-    A scale multiplies those of depth and leaves those of normals; what a shift makes of them is not known.
-    """
+    """Return the expected errors of an aligned prediction: a scale multiplies those of depth, a shift loses them."""
     if errors is None or how == "none":
         return errors
     return (errors[0] * (aligned / depth), errors[1]) if how == "scale" else None

@@ -34,10 +34,7 @@ def measured_errors(prediction: Tensor, target: Tensor, rays: Tensor) -> tuple[T
 
 
 def error_ratios(expected: Tensor, measured: Tensor, parts: int = 10) -> Tensor:
-    """Return the mean measured error over the mean expected error for equal parts of the pixels, (parts,).
-
-    The pixels are sorted by expected error. NaN for a part without pixels, infinite where expected errors are all 0.
-    """
+    """Return the mean measured over the mean expected error, (parts,), for parts of pixels sorted by the latter."""
     expected, measured = _ordered(expected, measured)
     pairs = zip(expected.tensor_split(parts), measured.tensor_split(parts), strict=True)
     return torch.stack([theirs.mean() / own.mean() for own, theirs in pairs])
@@ -64,10 +61,7 @@ def ence(expected: Tensor, measured: Tensor, parts: int = 10) -> Tensor:
 
 
 def sparsification(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Tensor:
-    """Return the mean error of the pixels left when those with the largest expected errors are removed, (steps + 1,).
-
-    Step t removes t / steps of the pixels. Pixels of equal expected error all have their mean error.
-    """
+    """Return the mean errors without the t / steps of the pixels with the largest expected errors, (steps + 1,)."""
     expected, measured = _ordered(expected, measured)
     count = len(measured)
     if not count:
@@ -79,10 +73,7 @@ def sparsification(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Te
 
 
 def ause(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Tensor:
-    """Return the area under the sparsification error, relative to the mean error; it depends on the number of steps.
-
-    It is the curve of :func:`sparsification` less that of an oracle, which expects the measured errors.
-    """
+    """Return the area between :func:`sparsification` and that of an oracle, relative to the mean error."""
     measured = measured.masked_fill(~expected.isfinite(), torch.nan)
     curve, oracle = sparsification(expected, measured, steps), sparsification(measured, measured, steps)
     return torch.trapezoid((curve - oracle) / curve[0], dx=1 / steps)

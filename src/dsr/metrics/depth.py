@@ -117,10 +117,7 @@ def point_errors(pair: SurfacePair) -> dict[str, Tensor]:
 
 
 def nearest(points: Tensor, valid: Tensor, cloud: Tensor, known: Tensor) -> Tensor:
-    """Return the distance of each valid point (B, 3, H, W) from the nearest known one of a cloud (B, 3, H, W), exactly.
-
-    The distances, (B, 1, H, W), are 0 where there is no point, and infinite where there is no other one.
-    """
+    """Return the exact distances of valid points from the nearest known one of a cloud, (B, 1, H, W), else 0."""
     distances = torch.zeros_like(points[:, :1])
     for found, *image in zip(distances, points, valid, cloud, known, strict=True):
         own, has, other, there = (each.detach().cpu() for each in image)

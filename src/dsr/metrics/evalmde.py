@@ -56,10 +56,7 @@ def rel_normal(pair: SurfacePair) -> Tensor:
 
 
 def nearest_to_centres(mask: Tensor, scale: int) -> Tensor:
-    """Return which pixel stands for each block: the set one nearest to its centre, the first of equally near ones.
-
-    Indices into the flattened mask (B, 1, H, W), (B, ceil(H / scale), ceil(W / scale)); of any pixel where none is set.
-    """
+    """Return for each block the index, in the flattened mask, of the set pixel nearest to its centre, (B, h, w)."""
     (height, width), device = mask.shape[-2:], mask.device
     padded = torch.nn.functional.pad(mask, (0, -width % scale, 0, -height % scale))
     blocks = torch.nn.functional.pixel_unshuffle(padded.float(), scale)  # (B, scale^2, h, w), row by row
@@ -98,10 +95,7 @@ def sobol_pairs(height: int, width: int, device: torch.device) -> list[Tensor]:
 
 @once_per_pair
 def wkdr(pair: SurfacePair) -> Tensor:
-    """Return the fraction of ordered pairs (i, j) of true pixels that the prediction has in another order, (B,).
-
-    These are the pairs for which only one map has depth i < depth j, and those with a hole of the prediction.
-    """
+    """Return the fraction of ordered pairs of true pixels that the prediction has in another order or lacks, (B,)."""
     from scipy.stats import kendalltau  # noqa: PLC0415 - it takes half a second to import
 
     errors = []

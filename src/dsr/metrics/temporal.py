@@ -50,10 +50,7 @@ def temporal_noise(depths: Tensor, static: Tensor | None = None) -> Tensor:
 
 @in_own_precision
 def normal_flicker(depths: Tensor, camera: Camera, static: Tensor | None = None) -> Tensor:
-    """Return the mean over the pixels of the RMS angle over time between a normal and its mean direction, in degrees.
-
-    The camera stands still; a pixel counts if it has a normal in two frames or more.
-    """
+    """Return the mean over pixels of the RMS angle over time between a normal and its mean direction, in degrees."""
     known = _known(depths)
     normals = depth_to_normals(depths.masked_fill(~known, torch.nan), camera.rays(device=depths.device)[None])
     known = normals.isfinite().all(dim=1, keepdim=True)

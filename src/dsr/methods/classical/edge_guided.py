@@ -310,10 +310,7 @@ def find_recurring(lr: Tensor, scale: int, step: float) -> Tensor:
 
 
 def thin(mask: Tensor) -> Tensor:
-    """Thin a mask, (H, W), to lines about one pixel wide, preserving connectivity.
-
-    Zhang, Suen, *A Fast Parallel Algorithm for Thinning Digital Patterns*, CACM 27(3), 1984.
-    """
+    """Thin a mask, (H, W), to lines of about one pixel, preserving connectivity (Zhang, Suen, CACM 27(3), 1984)."""
     while True:
         before = mask
         for first, second in (((0, 2, 4), (2, 4, 6)), ((0, 2, 6), (0, 4, 6))):

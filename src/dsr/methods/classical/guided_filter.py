@@ -61,11 +61,7 @@ class Guided:
         return rows.clamp(0, height - 1), columns.clamp(0, width - 1)
 
     def interpolate(self) -> tuple[Tensor, Tensor]:
-        """Return the maps, (N, H, W), and their confidence, (H, W), at the high-resolution pixels.
-
-        A value is the bilinear mean of the valid ones among the four low-resolution pixels around it, and its
-        confidence their bilinear weight: 1 away from holes, 0 within them, where the value is inpainted.
-        """
+        """Return the maps, (N, H, W), bilinear means of valid pixels, and the bilinear weight of these, (H, W)."""
         height, width = self.valid.shape
         down, across = (  # weights of linear interpolation; edge pixels are repeated beyond the border
             (1 - (where.clamp(0, size - 1)[:, None] - torch.arange(size).to(where)).abs()).clamp(min=0)

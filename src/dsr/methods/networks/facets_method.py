@@ -202,9 +202,8 @@ def _describe_noise(given: Tensor, answer: Answer) -> MapNoise:
 def _rounding(inverse: Tensor, focal: float) -> tuple[Tensor, Tensor]:
     """Return the expected errors of maps rounded to few values, (B, 1, h, w), 0 where the values around a pixel differ.
 
-    That of depth is relative: a quarter of the step to the next value. That of the normal, in radians, is the tilt of a
-    surface that gains it up to the next other value. A rounded slope is a staircase; its largest relative step, twice,
-    limits those of single levels.
+    That of depth is relative, a quarter of the step to the next value, that of the normal, in radians, the tilt of a
+    surface that gains it up to the next other value.
     """
     nothing, known = torch.zeros_like(inverse), inverse.isfinite()
     values = inverse[known].unique()
@@ -224,7 +223,7 @@ def _rounding(inverse: Tensor, focal: float) -> tuple[Tensor, Tensor]:
     stairs = (larger <= _EVEN * smaller) & (torch.minimum(above[1:-1], above[:-2]) > _STAIR * borders[1:-1])
     if stairs.sum() < _STAIRS:
         return nothing, nothing
-    step = torch.cat((gaps[:1], smaller, gaps[-1:])) / values
+    step = torch.cat((gaps[:1], smaller, gaps[-1:])) / values  # of single levels at most _EXCESS of a staircase's
     relative = (step.clamp(max=_EXCESS * step[1:-1][stairs].max()) / 4)[level]
     low = -functional.max_pool2d(-torch.where(known, inverse, torch.inf), 3, stride=1, padding=1)
     high = functional.max_pool2d(torch.where(known, inverse, -torch.inf), 3, stride=1, padding=1)

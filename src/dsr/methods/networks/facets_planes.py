@@ -69,10 +69,7 @@ def smooth(values: Tensor, weight: Tensor, levels: int) -> list[Tensor]:
 
 
 def average_planes(planes: Tensor, weights: Tensor, reach: int) -> Tensor:
-    """Return averages of planes, extended to each pixel, ``reach`` pixels apart or less at the border.
-
-    ``planes`` are (B, facets, 3, h, w), ``weights`` (B, facets, 9, h, w), row by row.
-    """
+    """Return means of planes (B, facets, 3, h, w) ``reach`` pixels apart, by weights (B, facets, 9, h, w)."""
     if exporting():
         near = _extend_to_centre(_repeat_border(planes, reach), planes.shape, reach)
         return (weights.unflatten(2, (3, 3))[:, :, None] * near).sum(dim=(3, 4))

@@ -149,10 +149,7 @@ class MSGNet(DisparityNetwork):
         return ConvLayer(nn.Conv2d(before, after, kernel, padding=kernel // 2), 1 if self.covers else after)
 
     def forward(self, guidance: Tensor, depth: Tensor) -> Tensor:
-        """Map normalised inputs to the high-resolution residual, (B, 1, H, W), in units of the disparity's range.
-
-        ``guidance`` is that of :func:`guidance_map`, ``depth`` (B, 1, h, w) normalised disparity minus its mean.
-        """
+        """Map guidance (B, 1, H, W) and normalised disparity less its mean (B, 1, h, w) to the residual."""
         pyramid = [self.guidance[1](self.guidance[0](guidance))]  # (B, 32, H, W), (B, 32, H / 2, W / 2), ...
         for layer in self.guidance[2:]:
             pyramid.append(self.pool(layer(pyramid[-1])))

@@ -314,10 +314,7 @@ def blend_tiles(
     scale: int,
     progress: Steps | None = None,
 ) -> Tensor:
-    """Compute an image, (B, C, scale * h, scale * w), tile by tile and blend the tiles.
-
-    ``compute`` maps rows and columns of low-resolution pixels to high-resolution pixels, perhaps without the last ones.
-    """
+    """Compute an image, (B, C, scale * h, scale * w), in tiles of low-resolution rows and columns, and blend them."""
     total = torch.empty(0)
     for done, (row, column) in enumerate(itertools.product(rows, columns), 1):
         output = compute(row.read, column.read)

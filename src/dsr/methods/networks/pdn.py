@@ -141,10 +141,7 @@ class UnrolledHuber(nn.Module):
         self.log_steps = nn.Parameter(first.repeat(iterations, 1))  # (iterations, 3): sigma, tau, theta
 
     def forward(self, first: Tensor, weights: Tensor) -> Tensor:
-        """Map f, continued as :func:`pair_differences` takes it, and positive weights, (B, N, H, W), to u - f.
-
-        The iteration works on u - f, (B, 1, H, W). The weights are repeated beyond the border.
-        """
+        """Map f, as :func:`pair_differences` takes it, and positive weights, (B, N, H, W), to u - f, (B, 1, H, W)."""
         r, dtype = self.window // 2, weights.dtype
         slopes = pair_differences(first, self.window).to(dtype)
         data, huber = self.log_data.to(dtype).exp(), self.log_huber.to(dtype).exp()

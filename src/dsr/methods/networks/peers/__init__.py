@@ -73,10 +73,7 @@ class PeerNetwork(nn.Module, abc.ABC):
 
     @classmethod
     def convert(cls, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return the network's parameters by their names here, of those of any file by the authors' names.
-
-        Names that the authors' files do not have are kept, so that another network's file is recognised.
-        """
+        """Return the parameters by their names here; unknown names are kept, to recognise another network's file."""
         return tensors
 
 
