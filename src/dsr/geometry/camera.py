@@ -296,8 +296,7 @@ class Lens:
 def undistort(picture: np.ndarray, camera: Camera, lens: Lens, hole: float | None = None) -> np.ndarray:
     """Return a picture, (h, w) or (h, w, 3), as the pinhole camera of the same intrinsics sees it.
 
-    Without a ``hole``, the picture is a photo: it is interpolated, and continued at its border. With one, it is a map:
-    a pixel gets the value of the nearest one, and ``hole`` outside of the map.
+    Without a ``hole``, it is a photo, which is interpolated, else a map: a pixel gets the value of the nearest one.
     """
     if picture.shape[:2] != (camera.height, camera.width) or max(picture.shape[:2]) > _MOST:
         got = f"{picture.shape[1]} x {picture.shape[0]}"

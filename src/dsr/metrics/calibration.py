@@ -50,8 +50,7 @@ def squared_error_share(expected: Tensor, measured: Tensor, kept: float = 0.8) -
 def ence(expected: Tensor, measured: Tensor, parts: int = 10) -> Tensor:
     """Return the expected normalised calibration error: the mean of |RMSE - RMV| / RMV over equal parts of the pixels.
 
-    The parts are those of :func:`error_ratios`. RMSE is the root of a part's mean squared error, RMV that of its mean
-    variance, where an expected absolute error is a Gaussian's, of a standard deviation of sqrt(pi / 2) of it.
+    RMV is the root of the mean variance: an expected absolute error is a Gaussian's, sqrt(2 / pi) of its deviation.
     """
     expected, measured = _ordered(expected, measured)
     parts = max(1, min(parts, len(expected)))  # a part without a pixel has no mean

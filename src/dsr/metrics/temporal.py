@@ -35,9 +35,8 @@ _MOVING = 0.05  # change of the true depth, as a fraction of the frame's range, 
 def flicker(depths: Tensor, static: Tensor | None = None) -> Tensor:
     """Return the mean over the pixels of the standard deviation over time of depth, relative to its median over time.
 
-    Depths are (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN is a hole, and so is a depth that is not
-    positive. A pixel counts if it has a depth in two frames or more. ``static``, (1, 1, H, W) bool, are the pixels
-    where nothing moves. A fraction, (); NaN if no pixel counts.
+    Depths are (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN, and what is not positive, is a hole. A pixel
+    counts if it has a depth in two frames or more. ``static``, (1, 1, H, W) bool, are the pixels where nothing moves.
     """
     return masked_mean(*_spread(depths, static)).squeeze()
 
