@@ -14,7 +14,6 @@ _ARGUMENTS = {"depth-unit": "unit", "o": "folder"}  # options of the command tha
 
 CHECKS = 4  # version of the checks: to be increased when a warning is added or a limit changes
 
-
 # By code: the value from which on a warning is given, or the command refuses or asks. What to do about each is in
 # docs/checks.md, what the values come from in docs/measurements/checks.md. After a dot: another condition of a code.
 LIMITS: dict[str, float] = {

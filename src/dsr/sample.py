@@ -62,8 +62,7 @@ class Scene:
     """A photo and its high-resolution depth, before any downsampling.
 
     At a whole ratio, a measured map has H // ratio x W // ratio pixels and leaves out what remains of the photo at the
-    bottom and the right; at any other it covers the whole photo, and their aspect ratios may differ by 2 %. A region of
-    several objects, such as planes, numbers them from 1.
+    bottom and the right; at any other it covers the whole photo, and their aspect ratios may differ by 2 %.
     """
 
     dataset: str

@@ -37,8 +37,8 @@ from dsr.io.depth_files import DEPTH_SUFFIXES, write_depth_file
 from dsr.io.trajectories import read_poses
 from dsr.methods.classical.shape_from_shading import read_foreground
 from dsr.methods.networks.msg_net import MSGNet
+from dsr.methods.networks.peers import load_peer
 from dsr.methods.networks.peers.local_filters import SVLRM
-from dsr.methods.networks.peers.peer_network import load_peer
 from dsr.methods.networks.trained import load_msg_weights
 from dsr.metrics.lpips import load_lpips
 from fuzz.judging import REFUSALS, EscapedError, Place, RefusedError

@@ -41,7 +41,7 @@ from dsr.io.exports import read_input, write_input
 from dsr.io.inputs import read_picture
 from dsr.io.pairs import Pair
 from dsr.io.reading import Reading
-from dsr.methods.networks.peers.peer_network import read_tensors
+from dsr.methods.networks.peers import read_tensors
 from dsr.methods.networks.trained import NETWORKS, load_msg_weights
 from dsr.methods.networks.weight_files import is_dsr_weights, load_network
 from dsr.methods.recipe import read_recipe

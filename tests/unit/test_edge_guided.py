@@ -11,15 +11,17 @@ from scipy import ndimage
 from small_scenes import disparity_of, grid, sample_of
 
 from dsr.methods.base import NoSolutionError
-from dsr.methods.classical.edge_guided import EdgeGuided, bilateral_filter, find_reachable
-from dsr.methods.classical.edge_map import (
+from dsr.methods.classical.edge_guided import (
     PATCH,
+    EdgeGuided,
+    bilateral_filter,
     deduplicate,
     detect_edges,
     edge_distances,
     energy,
     find_nearest,
     find_overlaps,
+    find_reachable,
     label,
     orient,
     predict_edge_map,

@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from dsr.geometry import mesh as mesh_module
 from dsr.geometry.camera import Camera
-from dsr.geometry.mesh import project, select_points, simplify, thin, triangulate, vertex_normals
+from dsr.geometry.mesh import fuse_maps, project, select_points, simplify, thin, triangulate, vertex_normals
 from dsr.geometry.poses import PosedMap
-from dsr.geometry.tsdf import fuse_maps
 from dsr.io.exports import write_mesh
 
 CAMERA = Camera(40, 30, 50, 50, 19.5, 14.5)

@@ -17,14 +17,12 @@ from torch.nn import functional
 
 from dsr.geometry.camera import Camera, from_range
 from dsr.methods.base import Cost
-from dsr.methods.images import inpaint, resize_bicubic
-from dsr.methods.networks.dct import dct2, idct2
-from dsr.methods.networks.peers import dctnet, dornet, local_filters, pgsr
+from dsr.methods.images import dct2, idct2, inpaint, resize_bicubic
+from dsr.methods.networks.peers import PeerNetwork, dctnet, dornet, fold_batch_norm, load_peer, local_filters, pgsr
 from dsr.methods.networks.peers.dctnet import DCTNet, laplacian, transfer_edges
 from dsr.methods.networks.peers.dornet import DORNet, deformable_conv3x3
 from dsr.methods.networks.peers.local_filters import FDKN, SVLRM
 from dsr.methods.networks.peers.peer import Peer
-from dsr.methods.networks.peers.peer_network import PeerNetwork, fold_batch_norm, load_peer
 from dsr.methods.networks.peers.pgsr import PGSR
 from dsr.methods.networks.weight_files import has_weights, nearest_scale
 from dsr.methods.recipe import read_recipe

@@ -14,14 +14,17 @@ from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, from_range
 from dsr.geometry.surface import depth_to_normals
 from dsr.methods.classical.interpolation import Interpolation
-from dsr.methods.classical.potts import Regions, boundary_length, fit_albedo, fuse
 from dsr.methods.classical.shape_from_shading import (
+    Regions,
     ShadingSolver,
     ShapeFromShading,
+    boundary_length,
     compute_shading,
     compute_surface,
     conjugate_gradients,
+    fit_albedo,
     fit_lighting,
+    fuse,
 )
 from dsr.sample import Scene
 

@@ -71,7 +71,7 @@ def test_objective_reaches_that_of_another_algorithm(data_weight, holes):
     rgb = torch.from_numpy(rng.uniform(0, 1, (1, 3, 16, 16)))
     method = TotalGeneralisedVariation(iterations=3000, tolerance=0.0, data_weight=data_weight, second=2.0)
     tensors = method.diffusion_tensors(rgb)
-    reference, energy = _reference(coarse[0, 0].numpy(), tensors, method.alpha1, method.alpha0, data_weight)
+    reference, energy = _reference(coarse[0, 0].numpy(), tensors, method.first, method.second, data_weight)
     ours = energy(method.minimise(rgb, coarse, 2))
     assert ours == pytest.approx(reference, rel=1e-3)
     method.iterations = 20

@@ -15,8 +15,8 @@ from rich.console import Console
 from dsr.app.requests import FuseRequest
 from dsr.app.upsample.parts import ERRORS
 from dsr.app.upsample.stored import INFO, read_camera, read_complete, read_depth, read_errors, read_up
+from dsr.geometry.mesh import fuse_maps, suggest_voxel
 from dsr.geometry.poses import PosedMap, as_rigid, check_poses
-from dsr.geometry.tsdf import fuse_maps, suggest_voxel
 from dsr.io.exports import INPUT, read_input, world_comment, write_ply
 from dsr.io.images import read_pixels
 from dsr.io.scene_files import RGBD

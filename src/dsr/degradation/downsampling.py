@@ -1,14 +1,14 @@
 """Downsampling models: how a high-resolution depth map becomes a low-resolution one.
 
-Every model is a separable kernel, applied as two small matrices. It is batched and differentiable, and averages valid
-pixels only. Kernels for the factor f, in high-resolution pixels from the centre of the low-resolution pixel:
+Every model is a separable kernel, and averages valid pixels only. Kernels for the factor f, in high-resolution pixels
+from the centre of the low-resolution pixel:
 
 - ``box``: the mean of the f x f block.
 - ``nearest``: the block's pixel [f // 2, f // 2], as in ``depth[f // 2 :: f, f // 2 :: f]``.
 - ``bilinear``, ``bicubic`` (a = -0.5): antialiased, their kernels stretched by f, as Pillow resizes.
 - ``gaussian``: standard deviation ``sigma`` * f, truncated at three standard deviations.
 
-At the border, kernels are truncated and normalised. Hints are what a network may be given of a low-resolution map.
+At the border, kernels are truncated and normalised.
 """
 
 from __future__ import annotations
@@ -57,7 +57,6 @@ class Downsampling:
     assumed: Kernel | None = None
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for name, kernel in (("kernel", self.kernel), ("assumed", self.assumed or self.kernel)):
             expect_one_of(name, kernel, KERNELS)
         if not self.sigma >= _LEAST_SIGMA:
@@ -273,10 +272,7 @@ def known_kernels(facts: Tensor) -> list[str | None]:
 
 
 def relative_error(given: Tensor, result: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the relative error, 0 in holes and of outliers, and the known pixels, 0 or 1, (B, 1, h, w) each.
-
-    ``given`` (B, 1, h, w) and ``result`` (B, 1, H, W) are inverse depth.
-    """
+    """Return the relative error of inverse depth, 0 in holes and of outliers, and the known pixels, (B, 1, h, w)."""
     scale = result.shape[-1] // given.shape[-1]
     error = given / functional.avg_pool2d(result, scale) - 1
     known = error.isfinite() & (error.abs() < _LARGEST)

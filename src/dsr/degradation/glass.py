@@ -1,9 +1,8 @@
 """Clear, mirroring and glossy objects: a photo with one in it, its surface, and the depth that a sensor gives there.
 
 A sensor sees what is behind a clear object, nothing, the surface where it reflects enough, or a mixture; in a mirror it
-sees the virtual image. Of two captures of ClearGrasp (Sajjan et al., ICRA 2020; a RealSense D435), four bottles and
-three boxes, 28 to 65 % of an object's pixels are missing, and of the others 9 to 74 % lie within 20 mm of the surface,
-the others behind it, some beyond the background; the shares drawn here are wider. Shapes are seen along parallel rays.
+sees the virtual image. The shares drawn here are wider than those of ClearGrasp (Sajjan et al., ICRA 2020; a RealSense
+D435), where 28 to 65 % of an object's pixels are missing. Shapes are seen along parallel rays.
 """
 
 from __future__ import annotations
@@ -146,11 +145,13 @@ def _draw_pose(scene: Scene, depth: Tensor, radius: float, generator: torch.Gene
     pose = None
     for _ in range(4 if kind == "upright" else 1):
         u, v = (round(uniform(0.05, 0.98, generator) * (size - 1)) for size in (depth.shape[-1], depth.shape[-2]))
-        plane = _plane_at(depth, v, u, max(3, int(radius / 3)))
-        if plane is None:
+        reach = max(3, int(radius / 3))
+        part = depth[0, max(0, v - reach) : v + reach + 1, max(0, u - reach) : u + reach + 1].float().reciprocal()
+        inverse = float(part.nanmedian())
+        if not inverse > 0 or min(part.shape) < 2:
             continue
-        inverse, down, across = plane
-        if kind == "upright" and (standing := _standing(scene, (u, v), plane)) is not None:
+        down, across = (float(part.diff(dim=dim).nanmedian().nan_to_num(0)) for dim in (0, 1))  # by how much it grows
+        if kind == "upright" and (standing := _standing(scene, (u, v), (inverse, down, across))) is not None:
             return standing
         direction = math.sin(up), -math.cos(up)
         pose = Pose(u, v, direction, pitch, -pitch / math.sqrt(1 - pitch**2), uniform(0.7, 0.98, generator) / inverse)
@@ -163,7 +164,7 @@ def _draw_pose(scene: Scene, depth: Tensor, radius: float, generator: torch.Gene
 
 
 def _standing(scene: Scene, place: tuple[int, int], plane: tuple[float, float, float]) -> Pose | None:
-    """Return the pose of what stands on a plane in the image; None if one looks at it too much from above."""
+    """Return the pose of what stands on a plane, of inverse depth; None if one looks at it too much from above."""
     inverse, down, across = plane
     camera = scene.camera
     x, y = (place[0] - camera.cx) / camera.fx, (place[1] - camera.cy) / camera.fy
@@ -177,16 +178,6 @@ def _standing(scene: Scene, place: tuple[int, int], plane: tuple[float, float, f
     if not 0 < sine < 0.85 or cosine < 0.5:
         return None
     return Pose(place[0], place[1], (right / cosine, below / cosine), sine, c / cosine, 1 / inverse)
-
-
-def _plane_at(depth: Tensor, v: int, u: int, reach: int) -> tuple[float, float, float] | None:
-    """Return the median inverse depth around a pixel, and by how much it grows downwards and to the right."""
-    part = depth[0, max(0, v - reach) : v + reach + 1, max(0, u - reach) : u + reach + 1].float().reciprocal()
-    inverse = float(part.nanmedian()) if part.numel() else math.nan
-    if not inverse > 0 or min(part.shape) < 2:
-        return None
-    down, across = (float(part.diff(dim=dim).nanmedian()) for dim in (0, 1))
-    return inverse, 0.0 if math.isnan(down) else down, 0.0 if math.isnan(across) else across
 
 
 class _Room:

@@ -34,7 +34,6 @@ class Blobs:
     size: float = 12.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not 0 < self.share < 1:
             raise ValueError(f"share: expected a number above 0 and below 1, got {self.share}")
         if not self.size >= 1:
@@ -67,7 +66,6 @@ class Shadows:
     baseline: float = 0.2
 
     def __post_init__(self) -> None:
-        """Check the value."""
         if not 0 < abs(self.baseline) < float("inf"):
             raise ValueError(f"baseline: expected metres other than 0, got {self.baseline}")
 
@@ -77,11 +75,8 @@ class Shadows:
 
 
 def occluded(disparity: Tensor) -> Tensor:
-    """Return the mask of the pixels that a nearer one covers in a second image, (..., h, w) bool.
-
-    The disparity, (..., h, w) in pixels, is negative if the second camera is to the left.
-    """
-    if bool((disparity < 0).any()):
+    """Return the mask of the pixels, (..., h, w), that a nearer one covers in a second image, by their disparity."""
+    if bool((disparity < 0).any()):  # the second camera is to the left
         return occluded(-disparity.flip(-1)).flip(-1)
     seen_at = torch.arange(disparity.shape[-1], device=disparity.device) - disparity  # the column in the second image
     nearest = seen_at.nan_to_num(torch.inf).flip(-1).cummin(dim=-1).values.flip(-1)

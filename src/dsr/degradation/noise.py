@@ -20,6 +20,7 @@ from dsr.degradation.holes import dark, occluded
 from dsr.degradation.random_fields import chance, field_of, near_steps, power, uniform, waves_of
 from dsr.geometry.camera import RangeType
 from dsr.geometry.hole_size import window_maxima
+from dsr.utils.guards import expect_positive
 
 
 class Noise(Protocol):
@@ -48,7 +49,6 @@ class GaussianMultiplicative:
     std: float
 
     def __post_init__(self) -> None:
-        """Check the value."""
         if not 0 < self.std < 1:
             raise ValueError(f"std: expected a number above 0 and below 1, got {self.std}")
 
@@ -67,9 +67,8 @@ class TimeOfFlight:
         v = stereo_constant / z - doffs,
 
     which to first order makes the depth's standard deviation strength z^3 / stereo_constant^2 for ``doffs`` = 0: 1.8 mm
-    at 1 m, 15 mm at 2 m, 49 mm at 3 m, 116 mm at 4 m. It suits rooms: from about 10 m on, the tail of the distribution
-    reaches infinity. Their v lacks the shift of Middlebury's views of 2005 (``dmin.txt``), so their noise is larger; to
-    apply their model to such a scene, set ``doffs`` to that shift.
+    at 1 m, 116 mm at 4 m. It suits rooms: from about 10 m on, the tail of the distribution reaches infinity. Their v
+    lacks the shift of Middlebury's views of 2005 (``dmin.txt``), which ``doffs`` takes.
 
     Args:
         strength: the product of v and its standard deviation, in square pixels.
@@ -84,10 +83,8 @@ class TimeOfFlight:
     doffs: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
-        _expect_positive(strength=self.strength, stereo_constant=self.stereo_constant)
-        if not 0 <= self.doffs < math.inf:
-            raise ValueError(f"doffs: expected 0 or a positive number, got {self.doffs}")
+        expect_positive(strength=self.strength, stereo_constant=self.stereo_constant)
+        expect_positive(or_zero=True, doffs=self.doffs)
 
     def __call__(self, values: Tensor, generator: torch.Generator) -> Tensor:
         """Return noisy depth in metres, NaN in holes and where v is not positive, before or after the noise."""
@@ -103,8 +100,7 @@ class Kinect:
 
     The sensor counts disparity d = stereo_constant / z in eighths of a pixel (Khoshelham and Oude Elberink, *Accuracy
     and Resolution of Kinect Depth Data*, Sensors 2012), so depth comes in steps of step z^2 / stereo_constant. With the
-    defaults, noise and rounding together have their random error, 1.42e-3 z^2 m: 1.4 mm at 1 m, 6 mm at 2 m, 35 mm at
-    5 m. Nguyen, Izadi and Lovell (3DIMPVT 2012) measured 1.9, 6 and 41 mm. The noise of neighbouring pixels is
+    defaults, noise and rounding together have their random error, 1.42e-3 z^2 m. The noise of neighbouring pixels is
     independent here; that of a sensor, which matches windows, is not.
 
     Args:
@@ -129,11 +125,9 @@ class Kinect:
     farthest: float | None = 8.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
-        if not 0 <= self.std < math.inf:
-            raise ValueError(f"std: expected 0 or a positive number of pixels, got {self.std}")
         limits = {name: getattr(self, name) for name in ("nearest", "farthest") if getattr(self, name) is not None}
-        _expect_positive(step=self.step, stereo_constant=self.stereo_constant, jump=self.jump, **limits)
+        expect_positive(or_zero=True, std=self.std)
+        expect_positive(step=self.step, stereo_constant=self.stereo_constant, jump=self.jump, **limits)
         if not 0 <= self.dropout <= 1:
             raise ValueError(f"dropout: expected a number from 0 to 1, got {self.dropout}")
         if self.reach < 1 or not float(self.reach).is_integer():
@@ -164,12 +158,6 @@ class Kinect:
 
 def no_noise() -> None:
     """Return no noise, for ``noise=none``."""
-
-
-def _expect_positive(**values: float) -> None:
-    for name, value in values.items():
-        if not 0 < value < math.inf:
-            raise ValueError(f"{name}: expected a positive number, got {value}")
 
 
 def _positive(values: Tensor) -> Tensor:
@@ -358,16 +346,13 @@ def _stereo(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
     """Two cameras of a size of their own, whose map is enlarged to this one by repeating values."""
     length = _longest(values) ** math.sqrt(uniform(0, 1, generator))  # of the waves, in pixels of this map
     ratio = uniform(1, max(1.0, min(3.4, length / 2)), generator) if chance(0.7, generator) else 1.0
-    rows, columns = (_repeated(size, ratio, generator) for size in values.shape[-2:])
-    seen, shades = (each[:, rows[1]][..., columns[1]] for each in (values, luma))
-    return _match(seen, shades, length / ratio, generator)[:, rows[0]][..., columns[0]]
-
-
-def _repeated(size: int, ratio: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Return which of the sensor's pixels each of a map's repeats, and which of the map's each of the sensor's sees."""
-    shown = ((torch.arange(size) + uniform(0, 1, generator) * (ratio > 1)) / ratio).long()
-    count = int(shown[-1]) + 1
-    return shown, ((torch.arange(count) + 0.5) * (size / count)).long().clamp(max=size - 1)
+    repeats, sees = [], []  # which of the sensor's pixels each of the map's repeats, and which of the map's those see
+    for size in values.shape[-2:]:
+        repeats.append(((torch.arange(size) + uniform(0, 1, generator) * (ratio > 1)) / ratio).long())
+        count = int(repeats[-1][-1]) + 1
+        sees.append(((torch.arange(count) + 0.5) * (size / count)).long().clamp(max=size - 1))
+    seen, shades = (each[:, sees[0]][..., sees[1]] for each in (values, luma))
+    return _match(seen, shades, length / ratio, generator)[:, repeats[0]][..., repeats[1]]
 
 
 def _match(values: Tensor, luma: Tensor, length: float, generator: torch.Generator) -> Tensor:
@@ -382,7 +367,7 @@ def _match(values: Tensor, luma: Tensor, length: float, generator: torch.Generat
     stretch = uniform(1, 1.6, generator)
     waves = waves_of(values, length, generator, stretch)
     if length > 3:  # filters stop at steps
-        beside = _beside_steps(values, max(1, int(length / 4)))
+        beside = window_maxima(near_steps(values, 1).to(values), max(1, int(length / 4))) > 0
         waves = torch.where(beside, waves_of(values, length / 2.5, generator, stretch), waves)
     if chance(0.4, generator):  # rows are matched one by one
         waves = waves + uniform(0, 0.4, generator) * field_of(values, (0.3, max(length / 3, 0.3)), generator)
@@ -419,15 +404,11 @@ def _lose(
     return disparity.masked_fill(lost, torch.nan)
 
 
-def _beside_steps(values: Tensor, reach: int) -> Tensor:
-    """Return the mask of the pixels within ``reach`` pixels of a step between neighbours, (1, h, w)."""
-    return window_maxima(near_steps(values, 1).to(values), reach) > 0
-
-
 def _between(values: Tensor, most: int, generator: torch.Generator) -> Tensor:
     """Return the mask of pixels lost where two surfaces are seen, up to ``most`` pixels from steps, (1, h, w)."""
     reach = int(torch.randint(1, most + 1, (1,), generator=generator))
-    return _beside_steps(values, reach) & (field_of(values, 1.5, generator) > uniform(-2, 1, generator))
+    beside = window_maxima(near_steps(values, 1).to(values), reach) > 0
+    return beside & (field_of(values, 1.5, generator) > uniform(-2, 1, generator))
 
 
 NOISES: Mapping[str, Callable[[Tensor, Tensor, torch.Generator], Tensor]] = {

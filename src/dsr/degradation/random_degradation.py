@@ -2,12 +2,10 @@
 
 A degradation is drawn in three stages, each kind with its share:
 
-- a *kernel*: box, nearest, bilinear, bicubic, gaussian, or ``spread``, a wider gaussian, as of a sensor; after a small
-  displacement of depth against the photo in some cases, and after folds, and fine relief which the map shows only in
-  part, are added to the truth in some, and clear, mirroring and glossy objects, which sensors see wrongly;
-- *noise*: none, white, correlated, waves, or that of structured light, of time of flight, of a phone's lidar and of
-  stereo matching, which also lose pixels; some maps are rounded to the levels of a file;
-- *holes*: none, blobs, shadows, bands beside depth steps, dark surfaces, single pixels.
+- a *kernel*, also ``spread``, a wider gaussian, as of a sensor; before it, folds, fine relief, and clear, mirroring and
+  glossy objects are added to the truth in some cases, and depth is displaced against the photo;
+- *noise*, also of cameras, which lose pixels, too; some maps are rounded to the levels of a file;
+- *holes*: blobs, shadows, bands beside depth steps, dark surfaces, single pixels.
 
 All random numbers come from one generator. Maps are inverse depth, in which planes are linear, in 1/m.
 """
@@ -88,7 +86,6 @@ class Everything:
     told: float = 0.6
 
     def __post_init__(self) -> None:
-        """Check the values."""
         known = {"kernels": (*KERNELS, "spread"), "noises": ("none", *NOISES), "holes": ("none", *HOLES)}
         for name, kinds in known.items():
             shares = getattr(self, name)
@@ -139,8 +136,10 @@ class Everything:
         if not bool(noisy.isfinite().any()):
             raise AllHolesError(scene.name)
         rgb = scene.rgb.float()
-        if chance(self.textured, generator):
-            rgb = print_pattern(rgb, generator)
+        if chance(self.textured, generator):  # values may exceed 1
+            pattern = field_of(rgb[:1], power(0, 1.2, generator), generator)
+            colour = 0.2 * torch.randn((3, 1, 1), generator=generator) + uniform(0.1, 0.5, generator)
+            rgb = rgb * (1 + colour * pattern.clamp(-2, 2)).clamp(min=0)
         if chance(self.photo / (1 + (kind == "none")), generator):
             rgb = take_another_photo(rgb, generator)
         sample = unchecked(
@@ -228,13 +227,6 @@ def round_values(values: Tensor, generator: torch.Generator) -> Tensor:
         return ((values.reciprocal() / step).round() * step).clamp(min=step).reciprocal()
     top = float(values.nan_to_num(0).max()) * uniform(1, 1.3, generator)
     return ((values / top * 255).round() / 255 * top).clamp(min=top / 255)
-
-
-def print_pattern(rgb: Tensor, generator: torch.Generator) -> Tensor:
-    """Return a photo, (3, H, W), of surfaces on which a pattern is printed; values may exceed 1."""
-    pattern = field_of(rgb[:1], power(0, 1.2, generator), generator)
-    colour = 0.2 * torch.randn((3, 1, 1), generator=generator) + uniform(0.1, 0.5, generator)
-    return rgb * (1 + colour * pattern.clamp(-2, 2)).clamp(min=0)
 
 
 def take_another_photo(rgb: Tensor, generator: torch.Generator) -> Tensor:

@@ -124,8 +124,7 @@ def identify(depth: Tensor, name: str = "auto", device_name: str = "") -> Identi
     """Return the sensor of a map, (1, h, w) in metres, NaN in holes, as it was read; None for an unknown one.
 
     ``name`` is that of one of ``SENSORS`` or of a device, or ``none``. With ``auto``, the values and ``device_name``,
-    as the map's files state it, identify a sensor. If they contradict each other the values are decisive: the name may
-    be that of the photo's camera.
+    as the map's files state it, identify a sensor; the values are decisive, as the name may be of the photo's camera.
     """
     if name == "none":
         return None
@@ -212,11 +211,10 @@ _FINE = 4  # samples of the spectrum for each cycle that fits into the range of 
 def recognise_values(depth: Tensor) -> ValueSteps | None:
     """Return the steps of inverse depth in which a stereo or structured-light camera's map has its values.
 
-    The map, (1, h, w) in metres, is as it was read: neither resampled nor filtered. Its values are f B / d for
-    disparities d in whole steps. Where the rounding to millimetres, or tenths of them, does not hide it, inverse depths
-    are therefore multiples of step / (f B), and the sum of exp(2 pi i C / z) over the distinct values has a peak at
-    C = f B / step. None if the values keep to no steps, too few of them are seen, or they are not rounded as cameras
-    write them: the values of a computed plane may keep to steps, too.
+    The map, (1, h, w) in metres, is as it was read: neither resampled nor filtered. Its inverse depths are multiples of
+    step / (f B), where the rounding to millimetres does not hide it, and the sum of exp(2 pi i C / z) over the distinct
+    values has a peak at C = f B / step. None if the values keep to no steps, too few of them are seen, or they are not
+    rounded as cameras write them: the values of a computed plane may keep to steps, too.
     """
     depth = depth[:, :: max(1, round(depth.numel() / _PIXELS))]
     values, counts = torch.unique(depth[depth.isfinite()].double(), return_counts=True)

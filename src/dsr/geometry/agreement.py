@@ -1,12 +1,10 @@
 """Test whether a photo and a depth map show the same scene: agreement of their edges, compared with chance.
 
 Both are reduced to a small grid. An edge is a strength and a direction: where the logarithm of depth jumps, or a hole
-begins, as sensors leave shadows along silhouettes; and where the photo changes more than around it. The agreement at a
-displacement is the sum of the products of both strengths, mostly weighted with the cosine of twice the angle between
-both directions, which a photo of something else has as often negative as positive. Fourier transforms give it for all
-cyclic displacements of the photo at once; slow changes over displacements are removed, as they come from where in the
-picture edges are frequent. The best of a few pixels around no displacement, in standard deviations of the same over
-all other displacements, is the significance.
+begins; and where the photo changes more than around it. The agreement at a displacement is the sum of the products of
+both strengths, mostly weighted with the cosine of twice the angle between both directions. Fourier transforms give it
+for all cyclic displacements of the photo at once; slow changes over displacements are removed. The best of a few pixels
+around no displacement, in standard deviations of the same over all other displacements, is the significance.
 """
 
 from __future__ import annotations
@@ -106,7 +104,11 @@ def judge(depth: Array, rgb: Tensor, zooms: Sequence[float] = _ZOOMS) -> Verdict
         strength, direction = np.flip(given.strength, axes), np.flip(given.direction, axes)
         reversed_ = Outlines(strength, direction if len(axes) == 2 else direction.conj())
         ways[name] = _compare(fields, _transform(reversed_))
-    contours = max(depth.shape) >= _SIDE and _has_contours(outlines)
+    alike = np.hypot(_blur(outlines.direction.real, _CONTOUR), _blur(outlines.direction.imag, _CONTOUR))
+    coherence = alike / (_blur(outlines.strength, _CONTOUR) + 1e-3)  # 1 if neighbours have the same direction
+    length = float((outlines.strength * (2 * coherence - 1).clip(0, 1)).sum())
+    mean = float((outlines.strength * coherence).sum() / (outlines.strength.sum() + 1e-6))
+    contours = max(depth.shape) >= _SIDE and length >= _LENGTH and mean >= _COHERENCE
     if contours and zooms:
         double = min(2 * size[0], rgb.shape[-2]), min(2 * size[1], rgb.shape[-1])
         twice = from_numpy(reduce_photo(rgb, double)).permute(2, 0, 1)
@@ -115,15 +117,6 @@ def judge(depth: Array, rgb: Tensor, zooms: Sequence[float] = _ZOOMS) -> Verdict
             edges = photo_outlines(reduce_photo(view, size), max(size) / max(part.shape))
             ways[f"{zoom:g}"] = _compare(_transform(depth_outlines(part, size)), _transform(edges))
     return _conclude(_compare(fields, _transform(seen)), ways, contours=contours, size=tuple(rgb.shape[-2:]))
-
-
-def _has_contours(outlines: Outlines) -> bool:
-    """Return whether edges are long enough and run alike: coherence is 1 if neighbours have the same direction."""
-    strength, direction = outlines
-    alike = np.hypot(_blur(direction.real, _CONTOUR), _blur(direction.imag, _CONTOUR))
-    coherence = alike / (_blur(strength, _CONTOUR) + 1e-3)
-    length = float((strength * (2 * coherence - 1).clip(0, 1)).sum())
-    return length >= _LENGTH and float((strength * coherence).sum() / (strength.sum() + 1e-6)) >= _COHERENCE
 
 
 def _conclude(given: Agreement, ways: dict[str, Agreement], *, contours: bool, size: tuple[int, ...]) -> Verdict:
@@ -163,10 +156,7 @@ def significances(depths: Sequence[Outlines], photos: Sequence[Outlines]) -> Arr
 
 
 def find_misplaced(agreements: Array) -> list[tuple[int, int]]:
-    """Return the depth maps that fit another's photo clearly better than their own, each with that photo.
-
-    The agreements are the significance of each depth map with each photo, (N, N), of a pair on the diagonal.
-    """
+    """Return the pairs of a depth map and of another's photo that it fits clearly better, by significances (N, N)."""
     gains = agreements - np.maximum(np.diag(agreements), 0.0)[:, None]
     best = gains.argmax(axis=1) if gains.size else np.empty(0, int)
     least = LIMITS["photo-turned"]
@@ -189,10 +179,7 @@ def reduce_photo(rgb: Tensor, size: Size) -> _Floats:
 
 
 def photo_outlines(photo: _Floats, pixel: float) -> Outlines:
-    """Return the edges of a photo, (H, W, 3) at the size of the grid, relative to the mean gradient around each.
-
-    ``pixel`` is the width of a pixel of the depth map on the grid.
-    """
+    """Return the edges of a photo on the grid, (H, W, 3); ``pixel`` is the width of the depth map's pixel there."""
     right, down = _gradient(photo, max(pixel, 1.0) ** 0.5)
     steepest = (right * right + down * down).argmax(axis=-1)[..., None]
     right = np.take_along_axis(right, steepest, axis=-1)[..., 0]

@@ -61,7 +61,6 @@ class Camera:
     doffs: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check every field, take the absolute value of ``fy``, and make NumPy's numbers Python's."""
         for name in ("width", "height"):
             value = getattr(self, name)
             if not is_number(value) or not float(value).is_integer() or value < 1:
@@ -131,11 +130,7 @@ class Camera:
         return derived(self, width=int(width), height=int(height), cx=float(self.cx - left), cy=float(self.cy - top))
 
     def rescale(self, width: int, height: int) -> Camera:
-        """Return the camera of the same view, resampled to ``width x height`` pixels that cover the same area.
-
-        The image's outer edge (half a pixel beyond the first pixel centre) stays where it is, as for box downsampling:
-        fx' = fx * s, cx' = (cx + 0.5) * s - 0.5 with s = width / self.width; disparities, in pixels, scale by s too.
-        """
+        """Return the camera of the same view in ``width x height`` pixels; the image's outer edge stays where it is."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self,
@@ -183,10 +178,7 @@ class Camera:
         )
 
     def rotate90(self, turns: int = 1) -> Camera:
-        """Return the camera of the image turned by ``turns`` quarter turns counterclockwise, as ``torch.rot90`` does.
-
-        The baseline stays unchanged, because it only serves to convert between depth and disparity.
-        """
+        """Return the camera of the image turned by quarter turns counterclockwise, as by ``torch.rot90``."""
         camera = self
         for _ in range(turns % 4):
             camera = derived(
@@ -248,10 +240,7 @@ def to_range(depth: Tensor, camera: Camera, range_type: RangeType) -> Tensor:
 
 
 def from_range(values: Tensor, camera: Camera, range_type: RangeType) -> Tensor:
-    """Convert a range map to orthogonal depth in metres: the inverse of :func:`to_range`.
-
-    A disparity at or below -doffs lies at or beyond infinity and becomes NaN, a hole.
-    """
+    """Convert a range map to orthogonal depth in metres; disparities at or beyond infinity become NaN, a hole."""
     expect_one_of("range_type", range_type, RANGE_TYPES)
     if range_type == "orthogonal":
         return values
@@ -307,8 +296,7 @@ class Lens:
 def undistort(picture: np.ndarray, camera: Camera, lens: Lens, hole: float | None = None) -> np.ndarray:
     """Return a picture, (h, w) or (h, w, 3), as the pinhole camera of the same intrinsics sees it.
 
-    Without a ``hole``, the picture is a photo: it is interpolated, and continued at its border. With one, it is a map:
-    a pixel gets the value of the nearest one, and ``hole`` outside of the map.
+    Without a ``hole``, it is a photo, which is interpolated, else a map: a pixel gets the value of the nearest one.
     """
     if picture.shape[:2] != (camera.height, camera.width) or max(picture.shape[:2]) > _MOST:
         got = f"{picture.shape[1]} x {picture.shape[0]}"

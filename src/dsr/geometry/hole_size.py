@@ -29,11 +29,7 @@ def degrees_per_pixel(focal: float) -> float:
 
 
 def wide_holes(known: Tensor, width: float) -> Tensor:
-    """Return the parts of the holes of a map, (1, h, w) bool, that are wider than max(``width``, 5) pixels.
-
-    It is the morphological opening of the holes by a disc: a narrow part of a wide hole is not wide. At the border of
-    the map, a hole is wide from half of the width on, since it can be filled from one side only.
-    """
+    """Return the parts of holes, (1, h, w) bool, wider than max(``width``, 5) pixels: the holes' opening by a disc."""
     radius = max(width / 2, _NARROW)
     core = distance_to_known(known) - 0.5 > radius  # from the known pixel's edge
     return ~known & (distance_to_known(core) <= radius + 0.5)

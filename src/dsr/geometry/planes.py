@@ -1,13 +1,10 @@
 """Range type of a depth map from its planes: distances along the axis or the ray, or values that fall with distance.
 
-Planes become curved if distance along the ray is read as orthogonal depth: a plane is linear in 1 / z over the image.
 If the values s follow z = s / |r|**k, with k = 0 for orthogonal depth, 1 for distance along the ray, and -1 for
-orthogonal depth that was read as distance along the ray and divided by |r|, then 1 / s = (a u + b v + c) / |r|**k. This
-is linear in a, b, c and, as |r| changes little within a window, in k: 1 / s = a u + b v + c - k log|r| / s. A robust
-fit to windows of many sizes and positions estimates k. Windows with a good fit are planar and vote.
-
-Disparity and inverse depth, of any scale, are linear over a plane themselves, and their reciprocals are not. No camera
-is needed to distinguish them.
+orthogonal depth that was divided by |r|, then on a plane 1 / s = (a u + b v + c) / |r|**k. As |r| changes little within
+a window, this is nearly 1 / s = a u + b v + c - k log|r| / s. A robust fit to windows of many sizes and positions
+estimates k. Windows with a good fit are planar and vote. Disparity and inverse depth, of any scale, are linear over a
+plane themselves, and their reciprocals are not.
 """
 
 from __future__ import annotations
@@ -94,10 +91,7 @@ class InverseVotes(NamedTuple):
 
 
 def range_votes(values: Array, camera: Camera, step: float = 0.0) -> RangeVotes:
-    """Count the planar windows of a map that support each range type, by their exponents k.
-
-    The values are (H, W), positive, in any unit, NaN in holes; ``step`` is their rounding step as a fraction of them.
-    """
+    """Count the planar windows of a map, (H, W) positive, by range type; ``step`` is its values' relative step."""
     windows = _windows(values, camera)
     if not windows.inverse.size:
         return RangeVotes(0, 0, 0, 0)
@@ -116,10 +110,7 @@ def range_votes(values: Array, camera: Camera, step: float = 0.0) -> RangeVotes:
 
 
 def inverse_votes(values: Array) -> InverseVotes:
-    """Count in which windows of a map, (H, W) positive, NaN in holes, its values are linear, or their reciprocals.
-
-    Of a large map, every n-th pixel is read.
-    """
+    """Count in which windows of a map, (H, W) positive, NaN in holes, its values are linear, or their reciprocals."""
     values, camera = thinned(values, Camera.from_fov(ASSUMED_FOV, values.shape[1], values.shape[0]))
     deviations, planar = [], []
     with np.errstate(over="ignore", divide="ignore"):
@@ -187,11 +178,7 @@ def _totals(values: Array, rows: np.ndarray, columns: np.ndarray) -> Array:
 
 
 def _robust_fit(columns: Array, windows: _Windows) -> tuple[Array, Array, Array]:
-    """Return coefficients (N, k), weights (N, cells), 1 for inliers and 0 for outliers, and residuals (N, cells).
-
-    The first iterations minimise absolute deviations, which tolerates up to half of the cells as outliers; the others
-    use Tukey's biweight.
-    """
+    """Return coefficients (N, k), weights (N, cells), 1 for inliers and 0 for outliers, and residuals (N, cells)."""
     valid = windows.valid.astype(np.float64)
     weight = valid
     for iteration in range(_ITERATIONS + 1):
@@ -199,9 +186,9 @@ def _robust_fit(columns: Array, windows: _Windows) -> tuple[Array, Array, Array]
         residual = windows.inverse - (columns @ fit[..., None])[..., 0]
         size = np.abs(residual)
         scale = _SIGMA * _medians(size, windows.valid) + _EXACT
-        if iteration < _ITERATIONS // 2:
+        if iteration < _ITERATIONS // 2:  # of absolute deviations, which tolerates half of the cells as outliers
             weight = valid * (1 / np.maximum(size / scale, 0.05))
-        elif iteration < _ITERATIONS:
+        elif iteration < _ITERATIONS:  # Tukey's biweight
             weight = valid * np.square((1 - np.square(size / scale / 4)).clip(min=0))
     return fit, valid * (size < 3 * scale), residual
 

@@ -27,10 +27,7 @@ class Remark(NamedTuple):
 
 
 def judge_camera(camera: Camera, size_lr: tuple[int, int] | None = None) -> list[Remark]:
-    """Return remarks on implausible values of a camera; none for a usual one.
-
-    ``size_lr`` is the (height, width) of a depth map that another camera may have taken.
-    """
+    """Return remarks on a camera; ``size_lr`` is (height, width) of a depth map that another one may have taken."""
     found = []
     view, offset, (low, high) = view_of(camera), offset_of(camera), _USUAL_VIEW
     ratio = max(camera.fx, camera.fy) / min(camera.fx, camera.fy)

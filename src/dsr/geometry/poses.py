@@ -1,10 +1,9 @@
 """Poses of cameras: rigid transforms, and whether those of frames fit their depth maps.
 
 A pose is the transform from a camera's frame (x right, y down, z forward) to the world's, a 4 x 4 matrix in metres.
-:func:`check_poses` moves the points of one depth map into the view of another: where they see the same surfaces, the
-depths agree. That is measured under the poses as given, under each of :data:`READINGS`, other conventions and units,
-and without any motion, which shows how informative the frames are: before a wall, or of a camera that stands still, all
-readings agree.
+:func:`check_poses` moves the points of one depth map into the view of another, where depths should agree: under the
+poses as given, under each of :data:`READINGS`, other conventions and units, and without any motion, which shows how
+informative the frames are.
 """
 
 from __future__ import annotations
@@ -27,10 +26,7 @@ _TOLERANCE = 5e-3
 
 
 def as_rigid(values: Sequence[Sequence[float]] | np.ndarray, name: str) -> Matrix:
-    """Return a 3 x 4 or 4 x 4 transform as a 4 x 4 matrix whose rotation is orthonormal to rounding.
-
-    Errors begin with ``name``, such as the file that the numbers are from.
-    """
+    """Return a 3 x 4 or 4 x 4 transform as a 4 x 4 matrix with an orthonormal rotation; errors begin with ``name``."""
     expected = f"{name}: expected a matrix of 3 x 4 or 4 x 4 numbers, got"
     try:
         if not isinstance(values, np.ndarray) and any(isinstance(each, bool | str) for row in values for each in row):
@@ -60,10 +56,7 @@ def as_rigid(values: Sequence[Sequence[float]] | np.ndarray, name: str) -> Matri
 
 
 def orthonormal_error(turn: np.ndarray) -> float:
-    """Return how far the rows of a matrix R, (3, 3), are from orthonormal: the largest magnitude in R R' - 1.
-
-    It is infinite or NaN where the numbers are too large for that.
-    """
+    """Return the largest magnitude in R R' - 1 of a matrix R, (3, 3); infinite or NaN for numbers too large."""
     with np.errstate(over="ignore", invalid="ignore"):
         return float(np.abs(turn @ turn.T - np.eye(3)).max())
 
@@ -180,10 +173,7 @@ def sample(count: int) -> list[tuple[int, ...]]:
 
 
 def check_poses(count: int, load: Callable[[int], PosedMap | None]) -> Assumption | None:
-    """Compare some frames of a sequence with each other; see :func:`find_fault`.
-
-    ``load`` returns the frame of a number; None for one that cannot be read, or has no pose.
-    """
+    """Compare some frames of a sequence by :func:`find_fault`; ``load`` returns one, or None if it has no pose."""
     return find_fault(filter(None, map(load, group)) for group in sample(count))
 
 
@@ -228,10 +218,7 @@ def _compare(frame: _Reduced, other: _Reduced) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_fault(groups: Iterable[Iterable[PosedMap]]) -> Assumption | None:
-    """Return a warning where frames of a group disagree under the poses as given.
-
-    None where they agree, or show too little. A pair of frames counts as much as they disagree without motion.
-    """
+    """Return a warning where frames of a group disagree under the poses as given; None if they show too little."""
     pairs = [pair for group in groups for pair in itertools.combinations(map(_prepare, group), 2)]
     # (pairs, readings + 1) each: under all readings and, last, without motion
     overlap, agreed = np.reshape([_compare(*pair) for pair in pairs], (len(pairs), 2, len(READINGS) + 1)).swapaxes(0, 1)
@@ -240,7 +227,7 @@ def find_fault(groups: Iterable[Iterable[PosedMap]]) -> Assumption | None:
     seen = overlap >= _OVERLAP
     without = agreed[:, -1:]
     given = np.where(seen[:, :1], agreed[:, :1], without)
-    weight = seen * (1 - without)  # (pairs, readings + 1)
+    weight = seen * (1 - without)  # (pairs, readings + 1): as much as a pair disagrees without motion
     total = weight.sum(0)
     means = [(weight * each).sum(0) / np.maximum(total, 1e-9) for each in (agreed, given, without)]
     gain = means[0] - np.maximum(means[1], means[2])

@@ -1,10 +1,9 @@
 """The displacement of a depth map against its photo: a shift and a change of scale, found from edges, and undone.
 
-At each jump of depth between two neighbouring pixels, the photo's gradient in the same direction is read. If photo and
-depth belong together, the mean gradient has a distinct maximum at one shift. A search over whole pixels and steps of
-scale, by Fourier transforms, is refined to fractions of a pixel. A displacement counts only if the gain is significant,
-which is estimated from tiles of the image, because the pixels of a contour are correlated; a change of scale only if it
-gains beyond the best shift.
+At each jump of depth between two neighbouring pixels, the photo's gradient in the same direction is read. The mean
+gradient has a distinct maximum at one shift. A search over whole pixels and steps of scale, by Fourier transforms, is
+refined to fractions of a pixel. A displacement counts only if the gain is significant, which is estimated from tiles of
+the image; a change of scale only if it gains beyond the best shift.
 """
 
 from __future__ import annotations
@@ -60,35 +59,28 @@ class Displacement:
     moved: float = 0.0  # of a corner, in pixels of the photo, at most ``WORKING_SIZE`` on its longer side
 
     def __str__(self) -> str:
-        """Return the displacement of depth that is undone, for people."""
         across = f"{abs(self.right):.1f} px to the {'right' if self.right > 0 else 'left'}"
         down = f"{abs(self.down):.1f} px {'down' if self.down > 0 else 'up'}"
         return f"{across}, {down}" + (f", scale {self.scale:.4f}" if self.scale != 1 else "")
 
 
 class Edges(NamedTuple):
-    """Edges of a depth map in pixels of a photo: rows and columns, (2, N), of pixels where its gradients are read.
+    """Edges of a depth map in pixels of a photo: rows and columns, (2, N), of pixels where its gradients are read."""
 
-    ``right`` (``below``) has the pixels whose right (lower) neighbour has another depth.
-    """
-
-    right: Array
-    below: Array
+    right: Array  # the pixels whose right neighbour has another depth
+    below: Array  # likewise the lower one
 
 
 @dataclass(frozen=True)
 class _Comparison:
-    """Depth edges, the tile of each, and a photo's gradients at one working size, (height, width).
-
-    ``pixel`` is the width of a pixel of the depth map in working pixels, ``radius`` the largest shift.
-    """
+    """Depth edges, the tile of each, and a photo's gradients at one working size, (height, width)."""
 
     edges: Edges
     tiles: np.ndarray
     gradients: Gradients
     size: tuple[int, int]
-    pixel: int
-    radius: int
+    pixel: int  # width of a pixel of the depth map in working pixels
+    radius: int  # largest shift
 
     def scaled(self, scale: float) -> Edges:
         """Return the edges scaled about the middle."""
@@ -130,8 +122,10 @@ def find_displacement(depth_lr: Tensor, rgb: Tensor) -> Displacement | None:
     if len(tiles) < _LEAST_EDGES or int(tiles.max()) + 1 < _LEAST_TILES:
         return None
     photo = functional.interpolate(rgb[None].float().cpu(), size, mode="bilinear", antialias=True)[0]
-    gradients = _edge_gradients(photo.double().numpy())
-    comparison = _Comparison(Edges(right, below), tiles, gradients, size, factor, radius)
+    blurred = ndimage.gaussian_filter(photo.double().numpy(), (0, 0.7, 0.7))
+    largest = np.abs(np.diff(blurred, axis=2)).max(axis=0), np.abs(np.diff(blurred, axis=1)).max(axis=0)  # of channels
+    local = [np.minimum(each / (ndimage.uniform_filter(each, 31) + 0.01), 4) for each in largest]
+    comparison = _Comparison(Edges(right, below), tiles, (local[0], local[1]), size, factor, radius)
     down, across, scale = best = _search(comparison)
     sums = comparison.sums(*best)
     for simpler in ((0.0, 0.0, 1.0), (0.0, across, scale), (down, 0.0, scale)):
@@ -208,14 +202,6 @@ def _jumps(depth: Array, safe: NDArray[np.bool_], gap: int) -> Array:
     return np.stack((rows[kept], place[kept])).astype(np.float64)
 
 
-def _edge_gradients(photo: Array) -> Gradients:
-    """Return the largest gradients of the channels of a photo, (3, H, W), relative to their local mean, up to 4."""
-    blurred = ndimage.gaussian_filter(photo, (0, 0.7, 0.7))
-    right, below = np.abs(np.diff(blurred, axis=2)).max(axis=0), np.abs(np.diff(blurred, axis=1)).max(axis=0)
-    ratios = [np.minimum(gradient / (ndimage.uniform_filter(gradient, 31) + 0.01), 4) for gradient in (right, below)]
-    return ratios[0], ratios[1]
-
-
 def _mean_gradients(each: Iterable[Edges], gradients: Gradients, radius: int) -> Iterator[Array]:
     """Yield the mean gradient at some edges for every shift down and right up to a radius, (2 r + 1, 2 r + 1)."""
     largest = np.max([gradient.shape for gradient in gradients], axis=0)
@@ -240,10 +226,7 @@ def _standard_errors(gains: Array) -> float:
 
 
 def _search(comparison: _Comparison) -> tuple[float, float, float]:
-    """Return the best shift down and right with its scale, which is 1 unless another one clearly gains.
-
-    A search by every second pixel and in steps of scale gives the starts of those to fractions of a pixel.
-    """
+    """Return the best shift down and right with its scale, which is 1 unless another one clearly gains."""
     blur = 0.5 * comparison.pixel + 0.3  # about the uncertainty of an edge in the depth map
     right, below = (ndimage.gaussian_filter(gradient, blur) for gradient in comparison.gradients)
     scaled = (comparison.scaled(scale) for scale in _SCALES)

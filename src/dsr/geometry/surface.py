@@ -21,11 +21,9 @@ def depth_to_normals(depth: Tensor, rays: Tensor, dtype: torch.dtype | None = No
     """Return the unit normals of the surface, (B, 3, H, W), facing the camera (n . r < 0).
 
     First-order forward differences along u and v, the last column's and row's differences repeated: n = dP/dv x dP/du,
-    normalised (Voynov et al. 2019, section 3, with the border as its authors evaluate it).
-
-    For a pinhole camera the product is known in closed form. With z' and z'' the depths of the neighbours along u and v
-    it is, up to a positive factor, n = (fx (z' - z) z'', fy (z'' - z) z', -z' z'' - x n_x - y n_y), as n . r = -z' z''.
-    Unlike differences of points, this cancels digits only in z' - z.
+    normalised (Voynov et al. 2019, section 3, with the border as its authors evaluate it). With z' and z'' the depths
+    of the neighbours along u and v it is, up to a positive factor, n = (fx (z' - z) z'', fy (z'' - z) z',
+    -z' z'' - x n_x - y n_y), as n . r = -z' z''.
 
     Depth is (B, 1, H, W) in metres; normals that need a NaN are NaN. Rays are (B or 1, 3, H, W), of a pinhole camera
     with z = 1. ``dtype`` is that of the result, None for the depth's; differences, where digits cancel, are taken in
@@ -52,19 +50,13 @@ def depth_to_normals(depth: Tensor, rays: Tensor, dtype: torch.dtype | None = No
 
 
 def length(vectors: Tensor) -> Tensor:
-    """Return the Euclidean lengths of (..., 3, H, W) vectors, (..., 1, H, W).
-
-    Much faster on the CPU than ``torch.linalg.vector_norm`` over an axis that is not the last.
-    """
+    """Return the lengths of (..., 3, H, W) vectors, (..., 1, H, W); much faster on the CPU than ``vector_norm``."""
     x, y, z = vectors.split(1, dim=-3)
     return (x.square() + y.square() + z.square()).sqrt()
 
 
 def angle_between(first: Tensor, second: Tensor) -> Tensor:
-    """Return the angle between unit vectors, (..., 3, H, W) each, in degrees: (..., 1, H, W).
-
-    It is computed from the chord, which is precise for small angles, too.
-    """
+    """Return the angle between unit vectors, (..., 3, H, W), in degrees, (..., 1, H, W), by the precise chord."""
     return torch.rad2deg(2 * (length(first - second) / 2).clamp(max=1).asin())
 
 
@@ -81,10 +73,7 @@ def _repeat_last(values: Tensor, dim: int) -> Tensor:
 
 
 def lights(*, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
-    """Return the paper's lights e1..e4 in the camera frame, (4, 3) unit vectors that point from surface to light.
-
-    e1, e2, e3 are orthonormal, so renderings under them are the normal map in another basis; e4 is frontal.
-    """
+    """Return the paper's lights e1..e4 in the camera frame, (4, 3) unit vectors that point from surface to light."""
     return torch.tensor([light.direction for light in LIGHTS.values()], dtype=dtype, device=device)
 
 
@@ -99,11 +88,7 @@ def render(normals: Tensor) -> Tensor:
 
 
 def render_for_viewing(normals: Tensor) -> Tensor:
-    """Return a rendering for pictures, (B, 1, H, W) in (0, 1), in which floors and ceilings keep tone.
-
-    The cosine to the light is mapped to a brightness over its whole range from -1 to 1, as in the "half Lambert"
-    shading of Mitchell et al., "Shading in Valve's Source Engine", SIGGRAPH 2006 course.
-    """
+    """Return a rendering for pictures, (B, 1, H, W) in (0, 1), in which floors keep tone, as in "half Lambert"."""
     low, high, exponent = VIEWING_TONES
     cosine = shade(normals, torch.tensor([VIEWING_LIGHT], dtype=normals.dtype, device=normals.device))
     return low + (high - low) * ((1 + cosine) / 2).clamp(0, 1) ** exponent
@@ -112,10 +97,9 @@ def render_for_viewing(normals: Tensor) -> Tensor:
 def comparison(depth: Tensor, truth: Tensor | None, rays: Tensor, rgb: Tensor, depth_lr: Tensor) -> Tensor:
     """Return labelled panels of a result, its input and the true depth, (3, H', W') uint8; holes are black.
 
-    The first row has the photo, the input, the result and the truth, in the grey levels of the truth's range of depth
-    (near is bright); below it are the renderings under the four lights e1 .. e4, a column each: those of the result, of
-    the truth, and twice their difference. Without a truth there are only the photo, the input and the result. Depth is
-    (1, 1, h, w) in metres, the photo (1, 3, H, W) in [0, 1].
+    The first row has the photo, the input, the result and the truth, in the grey levels of the truth's range of depth;
+    below it are the renderings under the four lights, a column each: those of the result, of the truth, and twice their
+    difference. Depth is (1, 1, h, w) in metres, the photo (1, 3, H, W) in [0, 1].
     """
     size = depth.shape[-2:]
     shown = depth if truth is None else truth

@@ -88,10 +88,7 @@ class Outliers(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """A result with its expected errors, (1, H, W) each, None for a method that does not predict them.
-
-    Pixels that a method leaves out on purpose have errors and no depth.
-    """
+    """A result with its expected errors, (1, H, W), also where a method leaves out depth; None if not predicted."""
 
     depth: Tensor  # orthogonal, in metres, NaN where missing
     depth_error: Tensor | None = None  # expected absolute error in metres
@@ -118,8 +115,7 @@ class Surface(NamedTuple):
     def shares(self, limit: float) -> dict[str, float]:
         """Return the shares of the pixels that are ``measured``, ``filled`` and ``open``, which have no depth.
 
-        If ``filled`` is None, all depth is measured. With expected errors also the share of ``dubious`` depth, which is
-        expected to be off by more than ``limit`` of it, and of ``glass``, if it was looked for.
+        With expected errors also that of ``dubious`` depth, see :meth:`without_dubious`, and of ``glass``, if known.
         """
         known = self.depth.isfinite()
         filled = known & self.filled if self.filled is not None else known & False
@@ -185,7 +181,7 @@ class Method(abc.ABC):
         range_type: the range type that it works on. By default the downsampling model is applied to that
             type, too, as in the paper, which evaluates every method on the type that it was designed for.
         history: of the last call of a method that iterates, one entry per recorded iteration: ``iteration`` first, then
-            the method's own quantities, such as ``objective`` and ``moved``, in an order of its own. None for others.
+            the method's own quantities, such as ``objective`` and ``moved``. None for others.
         name: in scores and tables, of a method that takes it from its input; None for that of its file of ``conf``.
 
     """
@@ -210,7 +206,7 @@ class Method(abc.ABC):
         """Return the HR orthogonal depth, (1, H, W) in metres on the sample's device, NaN where missing.
 
         A method never reads ``sample.depth``. One that takes several steps calls ``progress`` with the steps done and
-        their total. It raises a :class:`NoSolutionError` if there is no solution for this image.
+        their total.
         """
 
     def surface(self, sample: DepthSample, progress: Steps | None = None) -> Surface:
@@ -249,10 +245,3 @@ def whole_scale(sample: DepthSample) -> int:
     if not isinstance(sample.scale, int):
         raise ValueError(f"{sample.scene}: expected a whole scale for this method, got {round_ratio(sample.scale)}")
     return sample.scale
-
-
-def expect_positive(*, or_zero: bool = False, **options: float) -> None:
-    """Raise a ValueError for the first option that is not a positive finite number, nor 0 if that is allowed."""
-    for name, value in options.items():
-        if not (0 < value < float("inf") or (or_zero and value == 0)):
-            raise ValueError(f"{name}: expected {'0 or ' if or_zero else ''}a positive number, got {value}")

@@ -1,8 +1,7 @@
 """Depth maps predicted by another program, one file per scene, evaluated and shown like the results of a method.
 
 A monocular network's map has no scale, and often no shift. Such a map is fitted to the low-resolution one, robustly and
-without the truth, see :func:`fit_line`: in its own quantity, so that relative inverse depth, as of MiDaS and Depth
-Anything, is fitted in inverse depth.
+without the truth, in its own quantity: relative inverse depth, as of MiDaS and Depth Anything, in inverse depth.
 """
 
 from __future__ import annotations
@@ -178,10 +177,7 @@ def describe_fit(fit: str | None) -> str:
 
 
 def fit_to_map(values: Tensor, sample: DepthSample, quantity: str, fit: str, place: Path) -> Tensor:
-    """Return values of a quantity, (1, H, W) on the CPU in any unit, NaN in holes, fitted to the low-resolution map.
-
-    The sample's truth is not looked at; ``place`` is the file that the values are of, for messages.
-    """
+    """Return values of a quantity, (1, H, W) on the CPU in any unit, NaN in holes, fitted to the low-resolution map."""
     values = values.to(torch.float64)
     own, theirs = _both_known(values, from_depth(sample.depth_lr.to("cpu", torch.float64), sample, quantity))
     if own.numel() < 2:
@@ -194,10 +190,7 @@ def fit_to_map(values: Tensor, sample: DepthSample, quantity: str, fit: str, pla
 
 
 def fit_line(values: Tensor, target: Tensor, *, shift: bool = True) -> tuple[float, float]:
-    """Return the gain and shift, or 0 for it, of ``gain * values + shift`` with the least sum of absolute errors.
-
-    Reweighted least squares, which begin at the line of least squares; outliers, as at depth steps, hardly count.
-    """
+    """Return gain and shift, or 0, of the least sum of absolute errors, by reweighted least squares."""
     weight, line = torch.ones_like(values), torch.zeros(2, dtype=values.dtype)
     floor = 1e-6 * float(target.abs().median()) + torch.finfo(values.dtype).tiny
     mean = middle = values.new_zeros(())

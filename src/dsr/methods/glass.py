@@ -76,8 +76,7 @@ def glass_finder(device: torch.device) -> GlassFinder:
 def probability_of_glass(rgb: Tensor, inverse: Tensor) -> Tensor:
     """Return how probable it is that depth is not that of the surface which the photo shows, (1, H, W) float32.
 
-    ``rgb`` (3, H, W) is the photo in [0, 1], ``inverse`` (1, h, w) the inverse depth as measured, in 1/m, NaN in holes.
-    It is 0 where no hole is near, and everywhere in a map of single points.
+    ``rgb`` (3, H, W) is in [0, 1], ``inverse`` (1, h, w) in 1/m as measured. It is 0 where no hole is near.
     """
     height, width = rgb.shape[-2:]
     inverse = inverse.to(rgb.device, torch.float32)
@@ -103,15 +102,17 @@ def expect_glass(rgb: Tensor, inverse: Tensor) -> Tensor:
 def glass_features(rgb: Tensor, inverse: Tensor, grid: int = GRID, wide: float | None = WIDE) -> Tensor:
     """Return the features of the pixels of a grid, (FEATURES, g, g') float32, whose sides are 16 or more.
 
-    At least half of a pixel of the grid is known. ``grid`` are the pixels of its longer side; holes wider than ``wide``
-    of them do not count, except in the training, whose objects may be as large.
+    ``grid`` are the pixels of its longer side; holes wider than ``wide`` of them do not count, except in the training.
     """
     size = _grid_size(rgb.shape[-2], rgb.shape[-1], grid)
     photo = functional.interpolate(rgb[None].float(), size, mode="bilinear", antialias=True, align_corners=False)[0]
     logs, weight = _on_grid(inverse.float(), size)
     known = weight > 0.5
     holes = _holes(inverse.isfinite(), size, wide)
-    steps = {reach: _range_around(logs, known, reach) for reach in {*_NEAR, _AMID_REACH}}
+    steps = {}  # by how much the known values of windows differ, (1, g, g'); much less than 0 where there is none
+    for reach in {*_NEAR, _AMID_REACH}:
+        highest, lowest = (window_maxima((sign * logs).masked_fill(~known, -1e3), reach) for sign in (1, -1))
+        steps[reach] = highest + lowest
     around = steps[_AMID_REACH]
     amid = holes * ((around >= 0) & (around < _AMID_STEP))
     close = holes * ((steps[8] >= 0) & (steps[8] < 2 / 3 * _AMID_STEP))
@@ -173,12 +174,6 @@ def _holes(known: Tensor, size: tuple[int, int], wide: float | None) -> Tensor:
 def _mode(values: Tensor, size: tuple[int, int]) -> str:
     """Return how a map is brought to a size: by means, or by repeating pixels."""
     return "area" if values.shape[-1] > size[1] else "nearest-exact"
-
-
-def _range_around(logs: Tensor, known: Tensor, reach: int) -> Tensor:
-    """Return by how much the known values of windows differ, (1, g, g'); much less than 0 where there is none."""
-    highest, lowest = (window_maxima((sign * logs).masked_fill(~known, -1e3), reach) for sign in (1, -1))
-    return highest + lowest
 
 
 def _blur(values: Tensor, deviation: float) -> Tensor:

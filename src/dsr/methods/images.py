@@ -1,7 +1,6 @@
-"""Operations on images and maps that methods share: values, sizes, holes and noise.
+"""Operations on images and maps that methods share: values, sizes, holes, noise and cosine transforms.
 
-While a network is exported to ONNX, some of them do the same in another way: in a graph no size of a tensor depends on
-values, and a loop that ends when nothing is missing has to be written as one.
+While a network is exported to ONNX, some of them do the same in another way: in a graph no size depends on values.
 """
 
 from __future__ import annotations
@@ -52,8 +51,8 @@ class Normalised(NamedTuple):
 def normalise(x: Tensor, min_max: Tensor | None = None) -> Normalised:
     """Return (x - min) / (max - min) per sample of (B, 1, H, W), over the finite values; the others become 0.
 
-    A constant map becomes 0 with a range of 0. Without a finite value, the minimum is NaN. ``min_max`` (B, 2, 1, 1) are
-    the minimum and maximum to use; None for those of the map.
+    A constant map becomes 0 with a range of 0. Without a finite value, the minimum is NaN. ``min_max`` (B, 2, 1, 1) is
+    what to use in place of the map's own.
     """
     min_max = compute_min_max(x) if min_max is None else min_max.to(x)
     minimum = min_max[:, :1]
@@ -63,10 +62,7 @@ def normalise(x: Tensor, min_max: Tensor | None = None) -> Normalised:
 
 
 def compute_min_max(x: Tensor) -> Tensor:
-    """Return the minimum and the maximum finite value of each map of (B, 1, H, W), (B, 2, 1, 1).
-
-    They are infinity and minus infinity for a map without a finite value.
-    """
+    """Return the minimum and maximum finite value of each map (B, 1, H, W), (B, 2, 1, 1), else inf and -inf."""
     invalid, dims = ~x.isfinite(), (-3, -2, -1)
     lowest = x.masked_fill(invalid, torch.inf).amin(dims, keepdim=True)
     return torch.cat((lowest, x.masked_fill(invalid, -torch.inf).amax(dims, keepdim=True)), dim=1)
@@ -143,9 +139,8 @@ def lr_coordinates(camera: Camera, camera_lr: Camera, device: torch.device | str
 def inpaint(x: Tensor, photo: Tensor | None = None) -> Tensor:
     """Replace the non-finite values of (B, 1, h, w) by means of the valid ones in 3 x 3 pixels, from outside in.
 
-    With a photo, the means are weighted by how alike the colours are, and pixels of the colour of a valid neighbour are
-    filled before others, so that values stop at the photo's edges. An image without a valid value stays unchanged. The
-    photo is (B, 3, H, W) in [0, 1], of any size.
+    With a photo, (B, 3, H, W) in [0, 1] of any size, the means are weighted by how alike the colours are, and pixels of
+    the colour of a valid neighbour are filled before others. An image without a valid value stays unchanged.
     """
     if not exporting() and bool(x.isfinite().all()):
         return x
@@ -243,8 +238,7 @@ def estimate_noise(depth_lr: Tensor) -> float:
     """Return the standard deviation of the relative noise of a depth map, (1, 1, h, w) in metres, NaN in holes.
 
     Immerkaer, *Fast Noise Variance Estimation*, CVIU 1996: the difference of two Laplacians, which is 0 on planes and
-    on straight edges; here of the logarithm of depth, with the 10th percentile instead of the mean: noise is
-    everywhere, while steps and curves of the surface are not. It is 0 without a valid 3 x 3 window.
+    on straight edges; here of the logarithm of depth, with the 10th percentile instead of the mean.
     """
     # a tenth of a normal variable's absolute values are below 0.12566 standard deviations
     return _low_quantile(depth_lr.double().log(), 1, 0.1) / 0.12566 / 6
@@ -253,9 +247,9 @@ def estimate_noise(depth_lr: Tensor) -> float:
 def estimate_sensor_noise(values: Tensor) -> float:
     """Return the standard deviation of a map's noise, also where a sensor rounds its values or neighbours share noise.
 
-    As :func:`estimate_noise`, with a quarter of the responses instead of a tenth, because rounding makes many of them
-    0, and the larger of the estimates from neighbouring pixels and from every second one, because the first misses
-    correlated noise. ``values`` (1, 1, h, w) are in a unit in which planes are linear and noise is alike everywhere.
+    As :func:`estimate_noise`, with a quarter of the responses, because rounding makes many of them 0, and the larger of
+    the estimates from neighbouring pixels and from every second one, because the first misses correlated noise.
+    ``values`` (1, 1, h, w) are in a unit in which planes are linear and noise is alike everywhere.
     """
     # a quarter of a normal variable's absolute values are below 0.31864 standard deviations
     return max(_low_quantile(values.double(), stride, 0.25) for stride in (1, 2)) / 0.31864 / 6
@@ -276,3 +270,59 @@ def _low_quantile(values: Tensor, stride: int, fraction: float) -> float:
 def normal_noise_deg(noise: float, camera: Camera) -> float:
     """Return a frontal normal's standard deviation in degrees under relative depth noise s: a slope of sqrt(2) s f."""
     return math.degrees(math.atan(math.sqrt(2) * noise * camera.fx))
+
+
+def dct2(x: Tensor) -> Tensor:
+    """Return the discrete cosine transform, type II, of the last two axes of a real tensor, (..., H, W).
+
+    The coefficient (k, l) is 4 sum x(i, j) cos(pi k (2i + 1) / 2H) cos(pi l (2j + 1) / 2W). Makhoul, *A fast cosine
+    transform in one and two dimensions*, IEEE TASSP 28(1), 1980: along each axis, the values with even indices are put
+    first and those with odd indices follow in reverse order. With V the Fourier transform of the result, a(k) =
+    exp(-i pi k / 2H) and b(l) = exp(-i pi l / 2W), the cosine transform is 2 Re T for T(k, l) = b(l) (a(k) V(k, l) +
+    conj(a(k)) V(-k, l)), and at W - l it is -2 Im T(k, l), so half of the spectrum is enough.
+    """
+    height, width = x.shape[-2:]
+    half = width // 2 + 1
+    spectrum = torch.fft.rfft2(x[..., _order(height, x)[:, None], _order(width, x)])  # (..., H, W // 2 + 1)
+    spectrum = spectrum * (2 * _phase(height, height, x)[:, None] * _phase(width, half, x))
+    # conj(a(k)) V(-k, l), since a(H - k) = -i conj(a(k))
+    mirrored = torch.cat((spectrum[..., :1, :], 1j * spectrum[..., 1:, :].flip(-2)), dim=-2)
+    packed = spectrum + mirrored
+    return torch.cat((packed.real, -packed.imag[..., 1 : (width + 1) // 2].flip(-1)), dim=-1)
+
+
+def idct2(coefficients: Tensor) -> Tensor:
+    """Return the inverse of :func:`dct2`, the type III transform divided by 4HW, for (..., H, W)."""
+    height, width = coefficients.shape[-2:]
+    half = width // 2 + 1
+    reverse = -coefficients[..., width - half + 1 :].flip(-1)
+    imaginary = torch.cat((torch.zeros_like(coefficients[..., :1]), reverse), dim=-1)
+    packed = torch.complex(coefficients[..., :half], imaginary)
+    # T(H - k, l) for k > 0; there is no such term for k = 0
+    mirrored = torch.cat((torch.zeros_like(packed[..., :1, :]), packed[..., 1:, :].flip(-2)), dim=-2)
+    phase = _phase(height, height, packed)[:, None] * _phase(width, half, packed)
+    spectrum = (packed - 1j * mirrored) * (phase.conj() / 4)
+    shuffled = torch.fft.irfft2(spectrum, s=(height, width))
+    rows, columns = (_order(size, shuffled).argsort() for size in (height, width))
+    return shuffled[..., rows[:, None], columns]
+
+
+def laplacian_eigenvalues(height: int, width: int, like: Tensor) -> Tensor:
+    """Return the eigenvalues, none positive, of the five-point Laplacian in the basis of :func:`dct2`, (H, W)."""
+    rows, columns = (
+        torch.cos(math.pi / size * torch.arange(size, dtype=torch.float64, device=like.device))
+        for size in (height, width)
+    )
+    return (2 * (rows[:, None] + columns - 2)).to(like)
+
+
+def _order(size: int, like: Tensor) -> Tensor:
+    """Return the indices of an axis, the even ones first and then the odd ones in reverse order, (size,)."""
+    indices = torch.arange(size, device=like.device)
+    return torch.cat((indices[::2], indices[1::2].flip(0)))
+
+
+def _phase(size: int, count: int, like: Tensor) -> Tensor:
+    """Return exp(-i pi k / 2 size) for k < count, (count,), in the precision of ``like``."""
+    angle = torch.arange(count, dtype=torch.float64, device=like.device) * (-math.pi / (2 * size))
+    return torch.polar(torch.ones_like(angle), angle).to(like.dtype.to_complex())

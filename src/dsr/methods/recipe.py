@@ -1,8 +1,8 @@
 """A method before the factor is known: list, read and build the methods.
 
 A method is a file of ``conf/method``, in the project's configuration or in a directory of the user's: its ``method`` is
-a node whose ``_target_`` is the class that makes it, and whose other keys are the arguments; ``label`` is its name in
-tables. ``eval.py`` composes that file with Hydra, :func:`read_recipe` without, which is faster.
+a node whose ``_target_`` is the class that makes it; ``label`` is its name in tables. ``eval.py`` composes that file
+with Hydra, :func:`read_recipe` without, which is faster.
 """
 
 from __future__ import annotations
@@ -131,11 +131,7 @@ class Recipe:
         return find_weights(self.at(factor).get("weights"), factor, self.name)
 
     def build(self, factor: float, run: Run | None = None, **decided: Any) -> Method:
-        """Build the method for a factor.
-
-        ``run`` is what the run gives, None for what :class:`Run` has; ``decided`` are arguments that the caller decides
-        in place of the method's file, if the class names them.
-        """
+        """Build the method for a factor; ``decided`` are arguments that the caller decides, not the method's file."""
         given = {**vars(run or Run()), "scale": factor}
         known = given.pop("known")._asdict()
         if self.abilities.needs is not None:
@@ -196,14 +192,7 @@ def list_methods(directories: Sequence[Path] = ()) -> list[str]:
 
 
 def read_recipe(name: str, settings: Mapping[str, Any] | None = None, directories: Sequence[Path] = ()) -> Recipe:
-    """Read the file of a method; ``settings`` are arguments to change, by name.
-
-    Example:
-        >>> from dsr.methods.recipe import read_recipe
-        >>> read_recipe("tgv", {"iterations": 20}).abilities.ratios
-        'whole'
-
-    """
+    """Read the file of a method; ``settings`` are arguments to change, by name."""
     places = config_directories(directories)
     names = list_choices("method", places)
     if name not in names:

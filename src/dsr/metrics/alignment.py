@@ -2,15 +2,11 @@
 
 The field's ways, of which an evaluation takes one (``metrics.alignment``):
 
-- ``scale``: the prediction times the ratio of the medians of the two maps (Zhou et al., CVPR 2017; nianticlabs/
-  monodepth2 b676244, ``evaluate_depth.py``, which clamps to 80 m afterwards).
-- ``affine``: least squares of a z + b, clamped at 1e-4 m (``src/util/alignment.py`` of prs-eth/Marigold b1dffaa;
-  ``depth_affine_lst_sq_clip_by_0`` in ``evalmde/utils/depth.py`` of princeton-vl/EvalMDE ea9e21c).
-- ``affine_disparity``: least squares of a / z + b, the inverse depth, clamped at 1e-4 / m (Ranftl et al., *MiDaS*,
-  TPAMI 2022; EvalMDE's ``disparity_affine_clip_by_0``).
+- ``scale``: the prediction times the ratio of the medians of the two maps (Zhou et al., CVPR 2017).
+- ``affine``: least squares of a z + b, clamped at 1e-4 m (``src/util/alignment.py`` of prs-eth/Marigold b1dffaa).
+- ``affine_disparity``: least squares of a / z + b, clamped at 1e-4 / m (Ranftl et al., *MiDaS*, TPAMI 2022).
 - ``robust``: the a z + b of the least sum of |a z + b - t| / t, clamped as ``affine`` is (Wang et al., *MoGe*, CVPR
-  2025; ``align_depth_affine`` in ``moge/utils/alignment.py`` of microsoft/MoGe 0744441, which solves it for 64 x 64 of
-  the pixels). Here all count, by iteratively reweighted least squares.
+  2025; microsoft/MoGe 0744441 solves it for 64 x 64 pixels, here all count, by reweighted least squares).
 """
 
 from __future__ import annotations
@@ -35,8 +31,8 @@ _SMALLEST_ERROR = 1e-6  # relative, from which on their weights stay finite
 def align(prediction: Tensor, target: Tensor, mask: Tensor | None, how: str) -> Tensor:
     """Return each image's prediction aligned to its truth, (B, 1, H, W); no gradients are meant to pass.
 
-    Both are orthogonal depth in metres, the prediction's up to the alignment; NaN is a hole, and so is a depth that is
-    not positive. Only pixels of the mask with both depths count. Holes stay; NaN for an image without a pixel to fit.
+    Both are orthogonal depth, the prediction's up to the alignment; NaN, and a depth that is not positive, is a hole.
+    Only pixels of the mask with both depths count. Holes stay; NaN for an image without a pixel to fit.
     """
     if how not in ALIGNMENTS:
         raise ValueError(f"alignment: expected one of {', '.join(ALIGNMENTS)}, got {how!r}")
@@ -74,10 +70,7 @@ def align_map(depth: Tensor, truth: Tensor | None, how: str) -> Tensor:
 def align_errors(
     errors: tuple[Tensor, Tensor] | None, depth: Tensor, aligned: Tensor, how: str
 ) -> tuple[Tensor, Tensor] | None:
-    """Return the expected errors of depth and normals of an aligned prediction.
-
-    A scale multiplies those of depth and leaves those of normals; what a shift makes of them is not known.
-    """
+    """Return the expected errors of an aligned prediction: a scale multiplies those of depth, a shift loses them."""
     if errors is None or how == "none":
         return errors
     return (errors[0] * (aligned / depth), errors[1]) if how == "scale" else None

@@ -2,16 +2,13 @@
 
 An edge is a pair of pixels whose depths have a ratio above a threshold, found if the predicted ratio is above it, too.
 
-- Depth Pro (Bochkovskii et al., ICLR 2025; apple/ml-depth-pro 9efe5c1, ``src/depth_pro/eval/boundary_metrics.py``):
-  neighbours in a row or column; precision and recall are means over four directions, and a direction without edges
-  counts 0. So a truth may score less than 1 against itself: ``DepthPro_ceiling``.
-- MoGe (Wang et al., *MoGe-2*, 2025; microsoft/MoGe 0744441, ``moge/test/metrics.py``): pixels up to a radius apart in
-  any direction, counted together, without a border of the radius. Its weights of thresholds are Depth Pro's less 1.
-- iBims-1 (Koch et al., ECCV Workshops 2018; its Python v0.9, in bulatko/DepthART b2bc093,
-  ``mde/capsules/meter/ibims_official/evaluate_ibims_error_metrics.py``).
+- Depth Pro (Bochkovskii et al., ICLR 2025; apple/ml-depth-pro 9efe5c1): neighbours in a row or column; precision and
+  recall are means over four directions, and a direction without edges counts 0. So a truth may score less than 1.
+- MoGe (Wang et al., *MoGe-2*, 2025; microsoft/MoGe 0744441): pixels up to a radius apart in any direction, counted
+  together, without a border of the radius. Its weights of thresholds are Depth Pro's less 1.
+- iBims-1 (Koch et al., ECCV Workshops 2018; its Python v0.9, in bulatko/DepthART b2bc093).
 
-Unknown truth is left out of both maps. A prediction has no edges at its holes: true edges there are missed, but false
-ones cannot be there. Therefore ``Boundary_covered`` belongs to every score.
+Unknown truth is left out of both maps. Holes of a prediction have no edges, so ``Boundary_covered`` belongs to scores.
 """
 
 from __future__ import annotations
@@ -60,10 +57,7 @@ def count_edges(first: Tensor, second: Tensor) -> Tensor:
 
 @once_per_pair
 def depth_pro_scores(pair: SurfacePair) -> dict[str, Tensor]:
-    """Return Depth Pro's scale-invariant boundary F1 and its ceiling by name, (B,) each, fractions.
-
-    The ceiling is the F1 of the truth against itself: the fraction of directions that have edges.
-    """
+    """Return Depth Pro's boundary F1, and its ceiling, the truth's own, by name, (B,) each, fractions."""
     maps, counts = known_maps(pair), []
     for dim in (-1, -2):
         size = pair.target.shape[dim] - 1
@@ -116,9 +110,9 @@ def depth_boundaries(depth: Tensor) -> Tensor:
 def depth_boundary_error(found: Tensor, true: Tensor, quantile: float | None = None) -> tuple[Tensor, Tensor]:
     """Return iBims-1's accuracy and completeness of depth boundaries, (B,) float64 each, in pixels, lower is better.
 
-    The accuracy is the mean distance of found boundaries to true ones, (B, 1, H, W) bool, of those less than
-    :data:`DBE_RANGE` away; the completeness that of true boundaries to found ones, without limit. Both are that range
-    where no boundary is found within it, and NaN without true ones. ``quantile`` replaces the mean.
+    The accuracy is the mean distance, or a quantile, of found boundaries to true ones, (B, 1, H, W) bool, of those less
+    than :data:`DBE_RANGE` away; the completeness that of true boundaries to found ones, without limit. Both are that
+    range where no boundary is found within it, and NaN without true ones.
     """
     from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - as above
 
@@ -152,10 +146,7 @@ def boundary_errors(pair: SurfacePair) -> dict[str, Tensor]:
 
 @once_per_pair
 def directed_depth_error(pair: SurfacePair) -> dict[str, Tensor]:
-    """Return iBims-1's directed depth error about a plane at 3 m, three fractions of pixels, (B,) each.
-
-    They are on the right side, in front of it though the truth is not, and beyond it though the truth is not.
-    """
+    """Return iBims-1's directed depth error about a plane at 3 m: fractions right, before and beyond it, (B,) each."""
     before, truly = pair.prediction <= DDE_PLANE, pair.target <= DDE_PLANE
     parts = {"right": before == truly, "before": before & ~truly, "beyond": ~before & truly}
     return {name: masked_mean(part, pair.depth_mask).squeeze(1) for name, part in parts.items()}
@@ -165,9 +156,8 @@ def directed_depth_error(pair: SurfacePair) -> dict[str, Tensor]:
 def planarity(pair: SurfacePair) -> dict[str, Tensor]:
     """Return iBims-1's planarity errors, means over the large planes of the region ``planes``, (B,) each.
 
-    The prediction is scaled by the ratio of the two median depths in a plane, and a plane is fitted to the points of
-    either map. Flatness is the standard deviation of the predicted points about theirs in metres, orientation the angle
-    between the two normals in degrees. An image with a large plane without a prediction has NaN.
+    The prediction is scaled by the ratio of the median depths in a plane. Flatness is the standard deviation of the
+    predicted points about their plane in metres, orientation the angle between both normals in degrees.
     """
     numbers = pair.regions[PLANES]
     errors, large = [], []

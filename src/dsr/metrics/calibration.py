@@ -3,11 +3,9 @@
 These functions take expected and measured absolute errors of the same pixels, of any shape, and return float64. Pixels
 without either error, NaN, are left out; without any pixel the result is NaN.
 
-ENCE is that of Levi et al., *Evaluating and Calibrating Uncertainty Prediction in Regression Tasks*, Sensors 2022, with
-parts of equal numbers of pixels, while ``ENCE.py`` of EFS-OpenSource/calibration-framework (cc19d1b) has bins of equal
-width. AUSE is that of Ilg et al., *Uncertainty Estimates and Multi-Hypotheses Networks for Optical Flow*, ECCV 2018,
-with the subsets of ``compute_aucs`` in ``evaluate.py`` of mattpoggi/mono-uncertainty (543772b), which has 50 steps,
-does not divide by the mean error, and keeps all pixels of equal expected error or none.
+ENCE is that of Levi et al., Sensors 2022, with parts of equal numbers of pixels, not of equal width. AUSE is that of
+Ilg et al., ECCV 2018, with the subsets of mattpoggi/mono-uncertainty (543772b), which has 50 steps and does not divide
+by the mean error.
 """
 
 from __future__ import annotations
@@ -30,31 +28,20 @@ OFF = 0.02  # metres from which on a pixel is off
 
 
 def measured_errors(prediction: Tensor, target: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the absolute errors of depth in metres and of normals in degrees, (B, 1, H, W) each, NaN where undefined.
-
-    Prediction and target are (B, 1, H, W) orthogonal depth in metres, NaN in holes, the rays (B or 1, 3, H, W).
-    """
+    """Return the absolute errors of depth in metres and of normals in degrees, (B, 1, H, W) each, or NaN."""
     angles = angle_between(depth_to_normals(prediction, rays), depth_to_normals(target, rays))
     return (prediction - target).abs(), angles
 
 
 def error_ratios(expected: Tensor, measured: Tensor, parts: int = 10) -> Tensor:
-    """Return the mean measured error over the mean expected error for equal parts of the pixels, (parts,).
-
-    The pixels are sorted by expected error, those of equal expected error as they come. More than 1 means larger errors
-    than expected. NaN for a part without pixels, infinite for one whose expected errors are all 0.
-    """
+    """Return the mean measured over the mean expected error, (parts,), for parts of pixels sorted by the latter."""
     expected, measured = _ordered(expected, measured)
     pairs = zip(expected.tensor_split(parts), measured.tensor_split(parts), strict=True)
     return torch.stack([theirs.mean() / own.mean() for own, theirs in pairs])
 
 
 def squared_error_share(expected: Tensor, measured: Tensor, kept: float = 0.8) -> Tensor:
-    """Return the fraction of the sum of squared errors that lies in the pixels with the smallest expected errors, ().
-
-    Expected errors that have nothing to do with the measured ones give ``kept``, the fraction of pixels, on average;
-    the least possible value is that of ``squared_error_share(measured, measured)``.
-    """
+    """Return the fraction of the sum of squared errors in the ``kept`` pixels with the smallest expected errors, ()."""
     _, measured = _ordered(expected, measured)
     squares = measured.square()
     return squares[: round(kept * len(squares))].sum() / squares.sum()
@@ -63,8 +50,7 @@ def squared_error_share(expected: Tensor, measured: Tensor, kept: float = 0.8) -
 def ence(expected: Tensor, measured: Tensor, parts: int = 10) -> Tensor:
     """Return the expected normalised calibration error: the mean of |RMSE - RMV| / RMV over equal parts of the pixels.
 
-    The parts are those of :func:`error_ratios`. RMSE is the root of a part's mean squared error, RMV that of its mean
-    variance, where an expected absolute error is a Gaussian's, of a standard deviation of sqrt(pi / 2) of it.
+    RMV is the root of the mean variance: an expected absolute error is a Gaussian's, sqrt(2 / pi) of its deviation.
     """
     expected, measured = _ordered(expected, measured)
     parts = max(1, min(parts, len(expected)))  # a part without a pixel has no mean
@@ -74,10 +60,7 @@ def ence(expected: Tensor, measured: Tensor, parts: int = 10) -> Tensor:
 
 
 def sparsification(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Tensor:
-    """Return the mean error of the pixels left when those with the largest expected errors are removed, (steps + 1,).
-
-    Step t removes t / steps of the pixels. Pixels of equal expected error all have their mean error.
-    """
+    """Return the mean errors without the t / steps of the pixels with the largest expected errors, (steps + 1,)."""
     expected, measured = _ordered(expected, measured)
     count = len(measured)
     if not count:
@@ -89,21 +72,14 @@ def sparsification(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Te
 
 
 def ause(expected: Tensor, measured: Tensor, steps: int = STEPS) -> Tensor:
-    """Return the area under the sparsification error, relative to the mean error; it depends on the number of steps.
-
-    The sparsification error is the curve of :func:`sparsification` less that of an oracle, which expects the measured
-    errors.
-    """
+    """Return the area between :func:`sparsification` and that of an oracle, relative to the mean error."""
     measured = measured.masked_fill(~expected.isfinite(), torch.nan)
     curve, oracle = sparsification(expected, measured, steps), sparsification(measured, measured, steps)
     return torch.trapezoid((curve - oracle) / curve[0], dx=1 / steps)
 
 
 def off_auc(expected: Tensor, measured: Tensor, threshold: float = OFF) -> Tensor:
-    """Return the area under the ROC curve of expected errors that separate pixels with large errors from the others.
-
-    It is the probability that the former have larger expected errors; equal expected errors count half.
-    """
+    """Return the area under the ROC curve of expected errors that separate pixels with large errors from the others."""
     expected, measured = _ordered(expected, measured)
     of, sizes = expected.unique_consecutive(return_inverse=True, return_counts=True)[1:]
     off = expected.new_zeros(len(sizes)).index_add(0, of, (measured > threshold).to(expected))
@@ -164,12 +140,11 @@ def _per_image(
 
 
 _of_depth = partial(of_parts, "Calibration_", depth_calibration, depth_mask, min_size=1, stated="depth_error")
+_of_normals = column("AUSE", f"normals, {STEPS} steps", 1, 3)
 _covered = partial(Metric, min_size=1, stated="depth_error", regional=True, whole=True)
 METRICS: tuple[Metric, ...] = (
     *_of_depth({"ENCE": column("ENCE", "depth, %", 1e2), "AUSE_d": column("AUSE", f"depth, {STEPS} steps", 1, 3)}),
-    Metric(
-        "Calibration_AUSE_v", ause_v, normal_mask, column("AUSE", f"normals, {STEPS} steps", 1, 3), stated="angle_error"
-    ),
+    Metric("Calibration_AUSE_v", ause_v, normal_mask, _of_normals, stated="angle_error"),
     *_of_depth({"AUC_20mm": column("AUC", "off by 20 mm", 1, 3, higher_is_better=True)}, unit="cm"),
     *_of_depth({"stated": MetricFormat("Stated", "of true error", position=None)}),
     *_of_depth({"factor": column("Stated off", "factor", 1, 2)}),

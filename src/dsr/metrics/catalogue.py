@@ -17,17 +17,7 @@ from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, MIN_SIZE, lpips_v
 from dsr.sample import CENTIMETRES, Unit
 
-__all__ = [
-    "KNOWN_FORMATS",
-    "METRICS",
-    "PROTOCOLS",
-    "Metric",
-    "Score",
-    "catalogue",
-    "depth_mask",
-    "normal_mask",
-    "score_image",
-]
+__all__ = ["KNOWN_FORMATS", "PROTOCOLS", "Metric", "Score", "catalogue", "depth_mask", "normal_mask", "score_image"]
 
 
 def _bad_pixels(percent: int, unit: str, shown: str, position: int | None = None) -> Metric:
@@ -39,6 +29,7 @@ def _bad_pixels(percent: int, unit: str, shown: str, position: int | None = None
 
 _by_light = partial(Metric, per_light=True)
 _visual = partial(MetricFormat, unit="1/1000", factor=1e3, digits=0)
+_bump = MetricFormat("Bump_d", digits=2, position=6)
 _windows, _curvatures = attrgetter("ssim_mask"), attrgetter("bumpiness_mask")
 # the paper's metrics in the order of scores.csv; those with a position are the columns of its tables
 METRICS: tuple[Metric, ...] = (
@@ -58,9 +49,7 @@ METRICS: tuple[Metric, ...] = (
     _by_light("LPIPS_v", lpips_v, normal_mask, _visual("LPIPS_v", position=5), min_size=MIN_SIZE, perceptual=True),
     Metric("RMSE_v", functional.rmse_v, normal_mask, _visual("RMSE_v", position=7)),
     _by_light("RMSE_v1", functional.rmse_v1, normal_mask, _visual("RMSE_v1", position=None)),
-    Metric(
-        "Bumpiness_d", functional.bumpiness_d, _curvatures, MetricFormat("Bump_d", digits=2, position=6), min_size=3
-    ),
+    Metric("Bumpiness_d", functional.bumpiness_d, _curvatures, _bump, min_size=3),
 )
 
 
@@ -128,9 +117,6 @@ def score_image(
 ) -> Iterator[Score]:
     """Score one predicted depth map; NaN where no pixel can be scored.
 
-    Rows and columns at the border without any predicted pixel are cut off first (MSG's published networks leave out the
-    last of each), except for metrics of the whole image. The valid fractions still refer to the complete map.
-
     Both maps are (1, H, W) orthogonal depth in metres, NaN where missing, the rays (3, H, W), regions (1, H, W) uint8,
     and ``errors`` the method's expected errors, (1, H, W): of depth in metres, of normals in degrees. Metrics for other
     units, absent regions or absent errors are left out.
@@ -143,6 +129,7 @@ def score_image(
         stated = {"depth_error": errors[0][at], "angle_error": errors[1][at]} if errors else {}
         return SurfacePair(*parts, unit=unit, regions=inside, image_dtype=torch.float32, **stated)
 
+    # Rows and columns at the border without any predicted pixel, which MSG's published networks leave out, are cut off.
     whole = inner = pair_of()
     valid = prediction.isfinite()[0]
     if valid.any():

@@ -6,20 +6,13 @@
 - ``metrics=field``: RMSE and MAE of depth super-resolution in centimetres (NYU, RGB-D-D) or in 8-bit levels
   (Middlebury, Lu), and the fractions of pixels off by more than 5 cm or by a ratio of more than 1.25.
 - ``metrics=normals``: mean, median and fractions below five angles of Bae and Davison, CVPR 2024 (baegwangbin/DSINE
-  ef0c2af). Both normal maps are forward differences of depth; central differences have smaller angles for a noisy map,
-  by a fifth and more.
-- ``metrics=points``: the pixels with both depths and all pixels with a true depth as two clouds, P = z r in metres,
-  not thinned out. *Chamfer distance*: the mean of the mean distances of either cloud to the other (``chamfer_dist`` in
-  ``unidepth/utils/evaluation_depth.py`` of lpiccinelli-eth/UniDepth 8d8cfe4). *F-score*: the harmonic mean of precision
-  and recall, the fractions of the two clouds that are less than a threshold from the other one (Knapitsch et al.,
-  *Tanks and Temples*, SIGGRAPH 2017; ``eval_mesh`` in ``atlas/evaluation.py`` of magicleap/Atlas bee3ddb takes 5 cm, as
-  for ScanNet, and thins both clouds out to 2 cm first). *Flying pixels*: predicted points in the void between two
-  surfaces (Sabov and Krueger, SCCG 2008). A point flies if it lies between the front and the back of true depth
-  discontinuities within 16 pixels along rows and columns, as far as one low-resolution pixel reaches at x16, and more
-  than 1 % of its depth away from every true point.
+  ef0c2af). Both normal maps are forward differences of depth; central differences have smaller angles.
+- ``metrics=points``: the pixels with both depths and all pixels with a true depth as two clouds, not thinned out.
+  *Chamfer distance* as ``chamfer_dist`` of lpiccinelli-eth/UniDepth 8d8cfe4, *F-score* of Knapitsch et al., *Tanks and
+  Temples*, SIGGRAPH 2017. *Flying pixels* (Sabov and Krueger, SCCG 2008) lie between the front and the back of true
+  depth discontinuities within 16 pixels along rows and columns, and more than 1 % of their depth from every true point.
 
-Depth is orthogonal, in metres, neither capped nor cropped. Missing predictions are left out of every mean; the
-fractions ``covered`` stand beside them.
+Depth is neither capped nor cropped. Missing predictions are left out; the fractions ``covered`` stand beside the means.
 """
 
 from __future__ import annotations
@@ -38,7 +31,7 @@ from dsr.metrics.functional import SurfacePair, angle, masked_mean, masked_media
 _DELTAS = {"delta_105": 1.05, "delta_110": 1.1, "delta_125": 1.25, "delta_125_2": 1.25**2, "delta_125_3": 1.25**3}
 _WITHIN = {"within_5": 5, "within_7_5": 7.5, "within_11_25": 11.25, "within_22_5": 22.5, "within_30": 30}  # degrees
 EDGE_RATIO = 1.05  # of the depths of two neighbours at a discontinuity, as in Depth Pro's contours
-EDGE_RADIUS = 16  # pixels
+EDGE_RADIUS = 16  # pixels, as far as a low-resolution pixel reaches at x16
 FLYING = 0.01  # distance of a flying pixel from every true point, as a fraction of its depth
 
 
@@ -66,10 +59,7 @@ def depth_errors(pair: SurfacePair) -> dict[str, Tensor]:
 
 @once_per_pair
 def field_errors(pair: SurfacePair) -> dict[str, Tensor]:
-    """Return the errors of depth super-resolution by name, (B,) each.
-
-    RMSE and MAE are in the benchmark's unit, in which the prediction is clamped to the limits, as 8-bit levels are.
-    """
+    """Return the errors of depth super-resolution by name, (B,) each, in the benchmark's unit and its limits."""
     z, t = pair.prediction, pair.target
     mean = partial(masked_mean, mask=pair.depth_mask)  # (B, 1)
     converted = pair.unit.convert(z)
@@ -127,10 +117,7 @@ def point_errors(pair: SurfacePair) -> dict[str, Tensor]:
 
 
 def nearest(points: Tensor, valid: Tensor, cloud: Tensor, known: Tensor) -> Tensor:
-    """Return the distance of each valid point (B, 3, H, W) from the nearest known one of a cloud (B, 3, H, W), exactly.
-
-    The distances, (B, 1, H, W), are 0 where there is no point, and infinite where there is no other one.
-    """
+    """Return the exact distances of valid points from the nearest known one of a cloud, (B, 1, H, W), else 0."""
     distances = torch.zeros_like(points[:, :1])
     for found, *image in zip(distances, points, valid, cloud, known, strict=True):
         own, has, other, there = (each.detach().cpu() for each in image)
@@ -201,19 +188,16 @@ NORMALS = (
     *of_parts("Normal_", normal_errors, normal_mask, _normal),
     *of_parts("Normal_", normal_errors, true_normal_mask, _normals_covered, regional=True, whole=True),
 )
+_clouds = {
+    "chamfer": column("Chamfer", "mm", 1e3, 2),
+    "F_1cm": _fraction("F at 1 cm", "%", digits=2),
+    "F_5cm": _fraction("F at 5 cm", "%", digits=2),
+}
+_points_covered = _fraction("Covered", "points, %")
 _of_points = partial(of_parts, "Points_", point_errors, min_size=1, unit="cm", whole=True)
 POINTS = (
     # not of regions: the outlines of a region's objects are edges of what lies outside
     *_of_points(depth_mask, {"flying": column("Flying", "1 % of depth, %", 1e2, 2)}, regional=False),
-    *_of_points(
-        target_mask,
-        {
-            "chamfer": column("Chamfer", "mm", 1e3, 2),
-            "F_1cm": _fraction("F at 1 cm", "%", digits=2),
-            "F_5cm": _fraction("F at 5 cm", "%", digits=2),
-        },
-    ),
-    Metric(
-        "Points_covered", covered, target_mask, _fraction("Covered", "points, %"), min_size=1, unit="cm", whole=True
-    ),
+    *_of_points(target_mask, _clouds),
+    Metric("Points_covered", covered, target_mask, _points_covered, min_size=1, unit="cm", whole=True),
 )

@@ -1,15 +1,13 @@
 """RelNormal and SAWA-H of EvalMDE, and the parts of SAWA-H singly.
 
 Wu et al., *Toward a Better Understanding of Monocular Depth Evaluation* (arXiv 2510.19814); princeton-vl/EvalMDE
-ea9e21c, ``evalmde/metrics`` and ``evalmde/utils``. SAWA-H is a sum of errors, weighted to agree with human judgment:
+ea9e21c. SAWA-H is a sum of errors, weighted to agree with human judgment:
 
     SAWA-H = 3.65 wkdr + 0.18 beyond_disparity + 0.01 beyond_depth + 0.20 (1 - boundary F1) + 1.94 RelNormal
 
 WKDR is of all pairs of pixels, of which theirs draws 10^7 without a seed; Sobol points are in 64 bits, not 32.
 
-Pixels without a truth are left out. Holes of a prediction count as errors: pi in RelNormal, as theirs do; a pair of
-pixels in the wrong order; beyond the ratio; no edges where the truth has some. Only false edges are spared by holes,
-so ``EvalMDE_covered`` belongs to every score.
+Pixels without a truth are left out. Holes of a prediction count as errors, except for false edges, which they spare.
 """
 
 from __future__ import annotations
@@ -42,9 +40,8 @@ MIN_SIZE = 2 * SCALES[-1] + 1  # of a map with a normal at the coarsest scale
 def rel_normal(pair: SurfacePair) -> Tensor:
     """Return RelNormal, (B,) in radians, the mean error of the angle between two normals; lower is better.
 
-    At each of four scales, 10^6 pairs of pixels up to 32 pixels of scale 1 apart, and the mean of the scales' means. At
-    a coarser scale each block has the depth of the pixel with a truth that is nearest to its centre. A pair counts if
-    the truth has both normals, as an error of pi if the prediction has not.
+    At each of four scales, 10^6 pairs of pixels up to 32 pixels of scale 1 apart, and the mean of the scales' means.
+    A pair counts if the truth has both normals, as an error of pi if the prediction has not.
     """
     shape, found = pair.target.shape, []
     target = torch.where(pair.target_mask, pair.given[1], 1)
@@ -59,10 +56,7 @@ def rel_normal(pair: SurfacePair) -> Tensor:
 
 
 def nearest_to_centres(mask: Tensor, scale: int) -> Tensor:
-    """Return which pixel stands for each block: the set one nearest to its centre, the first of equally near ones.
-
-    Indices into the flattened mask (B, 1, H, W), (B, ceil(H / scale), ceil(W / scale)); of any pixel where none is set.
-    """
+    """Return for each block the index, in the flattened mask, of the set pixel nearest to its centre, (B, h, w)."""
     (height, width), device = mask.shape[-2:], mask.device
     padded = torch.nn.functional.pad(mask, (0, -width % scale, 0, -height % scale))
     blocks = torch.nn.functional.pixel_unshuffle(padded.float(), scale)  # (B, scale^2, h, w), row by row
@@ -78,10 +72,7 @@ def nearest_to_centres(mask: Tensor, scale: int) -> Tensor:
 @lru_cache(maxsize=2)
 @torch.inference_mode(mode=False)  # what is kept serves gradients, too
 def sobol_pairs(height: int, width: int, device: torch.device) -> list[Tensor]:
-    """Return the pairs of normals that RelNormal compares, for each scale (2, 10^6) int32 indices into its normal map.
-
-    They are the first of an unscrambled Sobol sequence in four dimensions inside the map (position, offset), sorted.
-    """
+    """Return the pairs of normals to compare, of a Sobol sequence, for each scale (2, 10^6) int32 indices."""
     engine, found = torch.quasirandom.SobolEngine(4), []
     draws: list[Tensor] = []
     for scale in SCALES:
@@ -104,10 +95,7 @@ def sobol_pairs(height: int, width: int, device: torch.device) -> list[Tensor]:
 
 @once_per_pair
 def wkdr(pair: SurfacePair) -> Tensor:
-    """Return the fraction of ordered pairs (i, j) of true pixels that the prediction has in another order, (B,).
-
-    These are the pairs for which only one map has depth i < depth j, and those with a hole of the prediction.
-    """
+    """Return the fraction of ordered pairs of true pixels that the prediction has in another order or lacks, (B,)."""
     from scipy.stats import kendalltau  # noqa: PLC0415 - it takes half a second to import
 
     errors = []

@@ -118,10 +118,7 @@ class Metric:
 
     @in_own_precision
     def variants(self, pair: SurfacePair) -> dict[str, Tensor]:
-        """Return the value per image, (B,), by variant: e1..e4, the worst of them and their average, or just "".
-
-        NaN for images below the metric's smallest size.
-        """
+        """Return the value per image, (B,), by variant, or just ""; NaN for images below the metric's smallest size."""
         pair = pair if self.region is None else pair.within(self.region)
         shape = (len(pair.target), len(LIGHT_NAMES)) if self.per_light else (len(pair.target),)
         small = min(pair.target.shape[-2:]) < self.min_size

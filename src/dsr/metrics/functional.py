@@ -198,19 +198,13 @@ def rmse_d(pair: SurfacePair) -> Tensor:
 
 
 def bad_pix_d(pair: SurfacePair, threshold: float, *, relative: bool = False) -> Tensor:
-    """Return the fraction of pixels whose perspective depths differ by more than a threshold, (B,).
-
-    The threshold is in metres, or a fraction of the target if ``relative``.
-    """
+    """Return the fraction of pixels whose perspective depths differ by more than metres, or a share of the truth."""
     limit = pair.target * pair.ray_lengths * threshold if relative else threshold
     return masked_mean(pair.perspective_error > limit, pair.depth_mask).squeeze(1)
 
 
 def mse_v(pair: SurfacePair) -> Tensor:
-    """Return MSE_v, (B,): the mean squared difference of the unclipped renderings under e1, e2, e3 (eq. 3).
-
-    As these lights are orthonormal, this is the mean squared difference of the normal maps' three components.
-    """
+    """Return MSE_v, (B,), eq. 3: under orthonormal lights the mean squared difference of the normals' components."""
     first, second = pair.normals
     return masked_mean((first - second).square().mean(dim=1, keepdim=True), pair.normal_mask).squeeze(1)
 
@@ -235,8 +229,7 @@ def bad_pix_v(pair: SurfacePair, threshold: float) -> Tensor:
 def dssim_v(pair: SurfacePair, mask: Tensor | None = None) -> Tensor:
     """Return DSSIM_v = 1 - SSIM per light, (B, 4), over windows at the centres in a mask, by default all valid ones.
 
-    SSIM (Wang et al. 2004) with a 7 x 7 uniform window, sample covariance and a data range of 2; windows that
-    would extend beyond the border are left out.
+    SSIM (Wang et al. 2004) with a 7 x 7 uniform window, sample covariance and a data range of 2, inside the map.
     """
     first, second = pair.renderings
     if min(first.shape[-2:]) < SSIM_WINDOW:
@@ -297,11 +290,8 @@ def ssim_map(x: Tensor, y: Tensor) -> Tensor:
 
 
 def _window_sum(values: Tensor) -> Tensor:
-    """Return the sums over all 7 x 7 windows inside the map, (..., H, W) -> (..., H - 6, W - 6).
-
-    Seven terms in four additions per axis: pairs, fours, four + two + one.
-    """
-    for axis in (-2, -1):
+    """Return the sums over all 7 x 7 windows inside the map, (..., H, W) -> (..., H - 6, W - 6)."""
+    for axis in (-2, -1):  # seven terms in four additions: pairs, fours, four + two + one
         size = values.shape[axis] - SSIM_WINDOW + 1
         pairs = values.narrow(axis, 0, size + 5) + values.narrow(axis, 1, size + 5)
         fours = pairs.narrow(axis, 0, size) + pairs.narrow(axis, 2, size)
@@ -310,10 +300,7 @@ def _window_sum(values: Tensor) -> Tensor:
 
 
 def _scharr(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the Scharr responses along v and along u, (B, 1, H, W) each; the outermost pixel is 0.
-
-    The response to a ramp of slope 1 per pixel is 2 (edge weights 1, 0, -1; smoothing 3/16, 10/16, 3/16).
-    """
+    """Return the Scharr responses along v and along u, (B, 1, H, W) each: 2 to a ramp of slope 1, 0 at the border."""
     found = []
     for along, across in ((-2, -1), (-1, -2)):
         size = values.shape[along] - 2

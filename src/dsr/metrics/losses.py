@@ -49,9 +49,9 @@ def mse(prediction: Tensor, target: Tensor, *, complete: bool | None = None) -> 
 def lap1(prediction: Tensor, target: Tensor, *, levels: int = 3, complete: bool | None = None) -> Tensor:
     """Return the Laplacian pyramid loss Lap_1 per pixel, (B,), as :func:`l1`: the sum of the levels' means.
 
-    This is eq. 2 per pixel: its weight of a level, 2^(2 j), cancels with the number of pixels that the level has. The
-    pyramid is linear, so it is built of the difference, which is 0 in holes; each level weights a pixel by the
-    valid fraction of its area. The shorter side has at least 3 * 2^(levels - 1) pixels.
+    This is eq. 2 per pixel: the weight of a level, 2^(2 j), cancels with its number of pixels. The pyramid is built of
+    the difference, 0 in holes, and weights a pixel by the valid fraction of its area. The shorter side has at least
+    3 * 2^(levels - 1) pixels.
     """
     difference, valid = _difference(prediction, target, complete)
     weight = None if valid is None else valid.to(difference.dtype)

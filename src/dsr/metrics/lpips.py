@@ -77,10 +77,7 @@ class LPIPS(nn.Module):
 
     @in_own_precision
     def forward(self, first: Tensor, second: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Return the distance of two images, (B, 3, H, W) in [-1, 1], at least 31 x 31: (B,).
-
-        With a mask, (B, 1, H, W) bool, each feature is weighted by the fraction of its pixels that is set.
-        """
+        """Return the distance of images (B, 3, H, W) in [-1, 1], (B,); features weigh by their share of ``mask``."""
         if min(first.shape[-2:]) < MIN_SIZE:
             came = tuple(first.shape[-2:])
             raise ValueError(f"LPIPS: expected images of at least {MIN_SIZE} x {MIN_SIZE} pixels, got {came}")

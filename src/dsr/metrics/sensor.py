@@ -1,10 +1,9 @@
 """Metrics of depth maps of real sensors: against a ground truth that is also measured, and of a board.
 
-- ``metrics=sensor``: neither map is perfect. The sensor has a constant bias, which is not shape, the truth ends at
-  ragged borders, and a few pixels of either belong to another surface. Therefore the scored pixels are those at least
-  four pixels away from unknown truth, and two away from unknown predictions and from those more than 0.1 m off, along
-  rows and columns. The median difference over them is subtracted from the prediction, and normals and renderings are
-  compared as in the paper's metrics, with unknown pixels replaced by the truth's median depth.
+- ``metrics=sensor``: neither map is perfect. The scored pixels are those at least four pixels away from unknown truth,
+  whose borders are ragged, and two away from unknown predictions and from those more than 0.1 m off, along rows and
+  columns. Their median difference, a bias of the sensor, is subtracted, and normals and renderings are compared as in
+  the paper's metrics, with unknown pixels replaced by the truth's median depth.
 - ``metrics=plane``: the plane of a board is the ground truth, known within its outline alone. The median difference is
   subtracted, and pixels more than 60 mm off belong to another surface.
 
@@ -111,8 +110,8 @@ def compare_board(pair: SurfacePair) -> tuple[Tensor, Tensor]:
 def board_errors(pair: SurfacePair) -> dict[str, Tensor]:
     """Return the scores of a board by name, (B,) each.
 
-    ``std`` is the standard deviation of depth about the plane in metres, ``angle`` the mean angle between the normals,
-    by differences over two pixels, and the plane's in degrees, ``covered`` the fraction of pixels of the board.
+    ``std`` is of depth about the plane in metres, ``angle`` the mean angle between its normal and those by differences
+    over two pixels in degrees, ``covered`` the fraction of pixels of the board.
     """
     scored, off = compare_board(pair)
     mean = masked_mean(off, scored)[..., None, None]
@@ -134,10 +133,7 @@ def board_errors(pair: SurfacePair) -> dict[str, Tensor]:
 
 
 def plane_normal(points: Tensor) -> Tensor:
-    """Return the normal of the plane through points (N, 3), (3,), of least squares along the axis that it faces most.
-
-    NaN for points in a line.
-    """
+    """Return the normal, (3,), of the least-squares plane through points (N, 3), NaN for points in a line."""
     centred = points - points.mean(dim=0)
     moments = centred.T @ centred
     others = torch.tensor([[1, 2], [0, 2], [0, 1]], device=points.device)
@@ -151,31 +147,19 @@ def plane_normal(points: Tensor) -> Tensor:
     return normal / normal.norm()
 
 
+_dssim = column("DSSIM_v", "sensor, 1/1000", 1e3, 0)
 _errors = partial(of_parts, "Sensor_", sensor_errors, whole=True)
 SENSOR: tuple[Metric, ...] = (
     *_errors(_scored, {"RMSE_v": column("RMSE_v", "sensor, 1/1000", 1e3, 0)}),
-    Metric(
-        "Sensor_DSSIM_v",
-        dssim_v,
-        _scored,
-        column("DSSIM_v", "sensor, 1/1000", 1e3, 0),
-        per_light=True,
-        min_size=SSIM_WINDOW,
-        whole=True,
-    ),
+    Metric("Sensor_DSSIM_v", dssim_v, _scored, _dssim, per_light=True, min_size=SSIM_WINDOW, whole=True),
     *_errors(_scored, {"angle_mean": column("Angle", "mean, deg"), "angle_median": column("Angle", "median, deg")}),
     *_errors(_inner, {"covered": column("Covered", "%", 1e2, higher_is_better=True)}),
     *_errors(_scored, {"offset": column("Offset", "mm", 1e3, 2), "RMSE_d": column("RMSE_d", "sensor, mm", 1e3, 2)}),
 )
+_board_covered = {"covered": column("Covered", "plane, %", 1e2, higher_is_better=True)}
 _board = partial(of_parts, "Plane_", board_errors)
 PLANE: tuple[Metric, ...] = (
     *_board(depth_mask, {"std": column("Std", "plane, mm", 1e3, 2)}, unit="cm"),
     *_board(depth_mask, {"angle": column("Angle", "plane, central, deg")}, min_size=3),
-    *_board(
-        target_mask,
-        {"covered": column("Covered", "plane, %", 1e2, higher_is_better=True)},
-        unit="cm",
-        regional=True,
-        whole=True,
-    ),
+    *_board(target_mask, _board_covered, unit="cm", regional=True, whole=True),
 )

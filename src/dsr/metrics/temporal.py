@@ -1,11 +1,11 @@
 """Metrics of depth over time: flicker of what stands still, and whether frames of a moving camera agree.
 
 - :func:`flicker`, :func:`temporal_noise` and :func:`normal_flicker` need a camera that stands still. Temporal noise is
-  ``calculate_temporal_noise`` in ``tools/depth-quality/rs-depth-quality.cpp`` of IntelRealSense/librealsense (cacc8e7).
+  that of IntelRealSense/librealsense (cacc8e7, ``rs-depth-quality.cpp``).
 - :func:`opw` needs poses: Wang et al., *Less Is More*, ACM MM 2022, and *Neural Video Depth Stabilizer*, ICCV 2023,
-  with the rigid flow of depth and pose; ``smooth_loss.py`` (d7b66e4) of RaymondWang987/NVDS.
-- :func:`tgm` needs a truth: temporal gradient matching of Chen et al., *Video Depth Anything*, CVPR 2025,
-  ``TemporalGradientMatchingLoss`` in ``loss/loss.py`` of DepthAnything/Video-Depth-Anything (4f5ae23), with one stride.
+  with the rigid flow of depth and pose; RaymondWang987/NVDS (d7b66e4).
+- :func:`tgm` needs a truth: temporal gradient matching of Chen et al., *Video Depth Anything*, CVPR 2025, with one
+  stride; DepthAnything/Video-Depth-Anything (4f5ae23).
 
 All are of one sequence, (), and lower is better. None knows whether the depth is right: a constant has the best of each
 but the last. Holes are left out, and :func:`covered` stands beside them.
@@ -35,28 +35,21 @@ _MOVING = 0.05  # change of the true depth, as a fraction of the frame's range, 
 def flicker(depths: Tensor, static: Tensor | None = None) -> Tensor:
     """Return the mean over the pixels of the standard deviation over time of depth, relative to its median over time.
 
-    Depths are (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN is a hole, and so is a depth that is not
-    positive. A pixel counts if it has a depth in two frames or more. ``static``, (1, 1, H, W) bool, are the pixels
-    where nothing moves. A fraction, (); NaN if no pixel counts.
+    Depths are (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN, and what is not positive, is a hole. A pixel
+    counts if it has a depth in two frames or more. ``static``, (1, 1, H, W) bool, are the pixels where nothing moves.
     """
     return masked_mean(*_spread(depths, static)).squeeze()
 
 
 @in_own_precision
 def temporal_noise(depths: Tensor, static: Tensor | None = None) -> Tensor:
-    """Return the median over the pixels of the deviation over time whose mean is :func:`flicker`.
-
-    Pixels that never have a depth are left out; Intel's tool counts them as 0.
-    """
+    """Return the median over the pixels that ever have a depth of the deviation whose mean is :func:`flicker`."""
     return masked_median(*_spread(depths, static)).squeeze()
 
 
 @in_own_precision
 def normal_flicker(depths: Tensor, camera: Camera, static: Tensor | None = None) -> Tensor:
-    """Return the mean over the pixels of the RMS angle over time between a normal and its mean direction, in degrees.
-
-    The camera stands still; a pixel counts if it has a normal in two frames or more.
-    """
+    """Return the mean over pixels of the RMS angle over time between a normal and its mean direction, in degrees."""
     known = _known(depths)
     normals = depth_to_normals(depths.masked_fill(~known, torch.nan), camera.rays(device=depths.device)[None])
     known = normals.isfinite().all(dim=1, keepdim=True)
@@ -79,9 +72,8 @@ def opw(
 ) -> Tensor:
     """Return the mean difference between the depth of a frame and that of the frame before, warped into its view.
 
-    The frame before is warped with a z-buffer, so that what a surface hides does not count, and what appears is a hole.
-    The authors' code normalises disparity, and its weights of colours from 0 to 255 leave hardly any pixel. Here it is
-    a weighted mean in metres.
+    The frame before is warped with a z-buffer: what a surface hides does not count, and what appears is a hole. Here it
+    is a weighted mean in metres; the authors' code normalises disparity.
 
     Args:
         depths: (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN is a hole.
@@ -123,7 +115,7 @@ def tgm(prediction: Tensor, target: Tensor, static: Tensor | None = None) -> Ten
     """Return the mean difference between the changes of predicted and true depth from frame to frame, () in metres.
 
     Depths are (T, 1, H, W) in metres, NaN in holes. Pixels count whose true depth changes by less than 5 % of the range
-    of the later frame's: it is of one surface. The authors' training takes ten times the value, of fitted disparity.
+    of the later frame's: it is of one surface.
     """
     if prediction.shape != target.shape:
         raise ValueError(f"target: expected shape {tuple(prediction.shape)}, got {tuple(target.shape)}")

@@ -78,11 +78,7 @@ class Curves(Callback):
 
 
 def log_layout(logger: TensorBoardLogger, titles: Mapping[str, str]) -> None:
-    """Lay out TensorBoard's *Custom scalars*: metrics of renderings first, then those of depth, then losses.
-
-    A chart has a metric's mean over all validation sets and, if there are several, the means of each, of the network
-    and of bicubic interpolation.
-    """
+    """Lay out TensorBoard's *Custom scalars*: metrics of renderings first, then those of depth, then losses."""
     groups = {
         **{title: {titles[name]: rf"(val|bicubic)(_[^/]*)?/{re.escape(name)}$" for name in names}
            for title, names in looks_and_depth(titles).items()},

@@ -127,14 +127,9 @@ class PatchData(lightning.LightningDataModule):
             for source, names in self.trained
         ]
         self._cut = Patches(
-            groups,
-            self.patches,
-            self._degradation,
-            shares=self._shares,
-            seed=self._seed,
-            everything=self._everything,
+            groups, self.patches, self._degradation, shares=self._shares, seed=self._seed, everything=self._everything,
             per_step=self._per_step,
-        )
+        )  # fmt: skip
         for kind, (source, names) in self.held_out.items():
             known = [scene for scene in map(source.load, names) if scene.depth is not None]
             if not known:
@@ -192,8 +187,7 @@ def _split(source: SceneSource, settings: PatchSettings) -> tuple[list[str], lis
 class _PatchNumbers:
     """The patch numbers of one device's batches in an epoch, from the trainer's current step on.
 
-    An epoch is the whole training or, where the trainer has no number of steps, about 1000 batches. The length is that
-    of the whole epoch, as Lightning subtracts the batches that were done before an interruption.
+    The length is that of the whole epoch, as Lightning subtracts the batches that were done before an interruption.
     """
 
     def __init__(self, trainer: lightning.Trainer | None, batch: int) -> None:
@@ -218,7 +212,6 @@ class _PatchLoader(DataLoader[Batch]):
     """A loader whose workers do not end before the training, if all get a signal, as from a cluster or a terminal."""
 
     def __iter__(self) -> Any:  # a type that torch does not export
-        """Start the workers."""
         with interruption.starting_workers(signal.SIGTERM):
             return super().__iter__()
 

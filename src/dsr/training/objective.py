@@ -1,10 +1,9 @@
 """The losses of trainings: of disparity and renderings, of Facets with its expected errors, and of shading.
 
 The shading loss is that of DDRNet (Yan et al., ECCV 2018): a photo against the shading of a surface under the light
-that explains it. A Lambertian surface with albedo R and normals n, under distant light, has the intensity B = R sum
-over b of l_b H_b(n), where the H_b are the nine spherical harmonics up to the second degree (Ramamoorthi and Hanrahan,
-SIGGRAPH 2001). The l_b of a photo are found by least squares with the normals of the reference depth. The albedo comes
-from the photo alone, by Retinex (Grosse et al., ICCV 2009), which DDRNet's authors recommend.
+that explains it, B = R sum over b of l_b H_b(n) of the albedo R and the nine spherical harmonics H_b up to the second
+degree (Ramamoorthi and Hanrahan, SIGGRAPH 2001) of the normals n. The l_b are found by least squares with the normals
+of the reference depth, the albedo from the photo alone, by Retinex (Grosse et al., ICCV 2009).
 """
 
 from __future__ import annotations
@@ -20,14 +19,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.surface import angle_between
-from dsr.methods.images import compute_min_max, grey, upsample_bicubic
-from dsr.methods.networks.dct import dct2, idct2, laplacian_eigenvalues
+from dsr.methods.images import compute_min_max, dct2, grey, idct2, laplacian_eigenvalues, upsample_bicubic
 from dsr.methods.networks.network import Answer, DisparityNetwork
 from dsr.metrics.functional import SurfacePair, masked_mean, mse_v
 from dsr.metrics.losses import MSE_V, VisualLoss, VisualLossName, l1, lap1, make_visual_loss, match_weight, mse
 from dsr.training.degradation import Batch
 from dsr.utils.compute_device import in_own_precision
-from dsr.utils.guards import expect_one_of
+from dsr.utils.guards import expect_one_of, expect_positive
 
 DepthLoss = Literal["lap1", "l1", "mse"]
 _TILT = math.asin(5 / 255)  # 1.1 degrees: changes a rendering under grazing light by 5 of 255, as for BadPix_v(5)
@@ -94,10 +92,8 @@ class DepthObjective(Objective):
     shading: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         expect_one_of("depth_loss", self.depth_loss, _DEPTH_LOSSES)
-        if not 0 <= self.shading < math.inf:
-            raise ValueError(f"shading: expected 0 or a positive number, got {self.shading}")
+        expect_positive(or_zero=True, shading=self.shading)
         if self.w != "auto" and not 0 <= self.w < math.inf:
             raise ValueError(f"w: expected auto or a number, 0 or more, got {self.w}")
 
@@ -163,10 +159,9 @@ class DepthObjective(Objective):
 class SurfaceObjective(Objective):
     """The loss of a network with expected errors: K Lap_1 + RMSE_v, and the likelihoods of its expected errors.
 
-    Lap_1 compares disparities divided by the truth's median. RMSE_v is that of each image, and not its square, so that
-    noisy maps do not outweigh clean ones. The RMSE of the divided disparities is added, with a larger weight where the
-    truth's depth steps are soft, so that a step whose place is uncertain gets soft, too. The expected errors are the
-    scales of Laplace distributions, of the logarithm of disparity and of the angle between the normals.
+    Lap_1 compares disparities divided by the truth's median. The RMSE of the divided disparities is added, with a
+    larger weight where the truth's depth steps are soft. The expected errors are the scales of Laplace distributions,
+    of the logarithm of disparity and of the angle between the normals.
 
     Args:
         depth: K.
@@ -298,9 +293,9 @@ def balance_weight(patches: Sequence[Batch], visual: VisualLoss = MSE_V) -> floa
     """Return the weight w with which a small tilt of the surface costs the same in both terms of the loss.
 
     A depth error of tan(a) z / f from one pixel to the next tilts the normal by a. The depth term of this error is
-    bf tan(a) / (f z range), where bf is the baseline times the focal length and range that of the low-resolution
-    disparities; MSE_v is (2 - 2 cos a) / 3. w is the median of their ratio over the patches, which have no batch axis.
-    For another visual loss, w makes it as large as w MSE_v would be for bicubic interpolation, where a training begins.
+    bf tan(a) / (f z range), with the range of the low-resolution disparities; MSE_v is (2 - 2 cos a) / 3. w is the
+    median of their ratio over the patches, which have no batch axis. Another visual loss becomes as large as w MSE_v
+    for bicubic interpolation.
     """
     if not patches:
         raise ValueError("patches: expected one or more to compute w from, got none")

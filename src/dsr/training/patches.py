@@ -1,8 +1,7 @@
 """Training patches: random windows of scenes, mirrored, turned, scaled in depth and changed in colour at random.
 
 Patch number i of a run is a pure function of (seed, i), and of the number of patches of a step where factors are drawn.
-So an interrupted run continues with the same patches, whatever the number of workers, and the patches of a step are the
-same on one device and on several.
+So an interrupted run continues with the same patches, whatever the number of workers and devices.
 """
 
 from __future__ import annotations
@@ -160,8 +159,7 @@ def augment(scene: Scene, settings: PatchSettings, random: np.random.Generator) 
 def soften(scene: Scene, sigma: float = 0.0, *, halve: bool = True) -> Scene:
     """Return a scene whose depth steps are soft: truths of benchmarks have 2 to 5 mixed pixels across a step.
 
-    Inverse depth is blurred by a Gaussian of ``sigma`` pixels of the result. With ``halve``, the result is half as
-    large: means of 2 x 2 pixels of the photo and of blurred inverse depth.
+    Inverse depth is blurred by a Gaussian of ``sigma`` pixels of the result, which ``halve`` makes half as large.
     """
     inverse = scene.true_depth.reciprocal()
     if sigma:

@@ -42,7 +42,6 @@ class PatchSettings:
     photo: float = 0.5
 
     def __post_init__(self) -> None:
-        """Check the values."""
         ranges = {"depth_scale": (0, _MAX_DEPTH_SCALE), "colour": (0, math.inf), "photo": (0, 1),
                   "patch": (_MIN_SIZE, math.inf), "batch": (1, math.inf), "workers": (0, math.inf),
                   "validation_scenes": (0, math.inf)}  # fmt: skip

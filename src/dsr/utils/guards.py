@@ -234,6 +234,13 @@ def expect_one_of(key: str, value: object, known: Collection[object]) -> None:
         raise ValueError(f"{key}: expected one of {names}, got {value!r}")
 
 
+def expect_positive(*, or_zero: bool = False, **options: float) -> None:
+    """Raise a ValueError for the first option that is not a positive finite number, nor 0 if that is allowed."""
+    for name, value in options.items():
+        if not (0 < value < float("inf") or (or_zero and value == 0)):
+            raise ValueError(f"{name}: expected {'0 or ' if or_zero else ''}a positive number, got {value}")
+
+
 @contextlib.contextmanager
 def refusing(message: str, *kinds: type[Exception]) -> Iterator[None]:
     """Raise a ValueError with a message in place of the errors from within that stand for something unexpected."""

@@ -8,35 +8,34 @@ Kopf, Cohen, Lischinski, Uyttendaele, *Joint Bilateral Upsampling*, SIGGRAPH 200
     S_p = 1 / k_p * sum over low-resolution pixels q of S_q f(|p - q|) g(|I_p - I_q|),
 
 with Gaussians f of the distance in low-resolution pixels and g of the colour difference, and the sum k_p of the
-weights. What differs: I_q is the mean colour over the low-resolution pixel, as low-resolution depth is a mean. Weights
-of each pixel are scaled so that the largest is 1: a pixel unlike all around it takes the most similar values.
+weights. What differs: I_q is the mean colour over the low-resolution pixel, and the largest weight of a pixel is 1.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.geometry.camera import RangeType
-from dsr.methods.base import Abilities, Cost, expect_positive
+from dsr.methods.base import Abilities, Cost
 from dsr.methods.classical.guided_filter import Guided, GuidedMethod, expect_window
 from dsr.methods.images import inpaint
 from dsr.sample import DepthSample
+from dsr.utils.guards import expect_positive
 from dsr.utils.progress import Steps
 
 _NO_WEIGHT = 10.0  # standard deviations of depth at which a pixel has no weight: exp(-50)
 
 
+@dataclass(eq=False)
 class Bilateral(GuidedMethod):
     """The bilateral filter of the low-resolution depth, and its interpolation where the scale is above 1.
 
-    The defaults suit structured-light and time-of-flight cameras at 0.5 to 2 m, whose noise is a few millimetres. Noise
-    grows with distance: a larger ``sigma_depth`` suits maps of rooms.
+    The defaults suit depth cameras at 0.5 to 2 m; noise grows with distance.
 
     Args:
         window: diameter of the window in low-resolution pixels.
@@ -48,22 +47,23 @@ class Bilateral(GuidedMethod):
     """
 
     abilities = Abilities(ratios="any", own_size=True, cost=Cost(150, 1))
-    range_type: RangeType = "orthogonal"
+    range_type = "orthogonal"
 
-    def __init__(
-        self, window: int = 19, sigma_depth: float = 0.03, sigma_space: float = 3.0, *, fill_holes: bool = False
-    ) -> None:
-        super().__init__(fill_holes=fill_holes, slopes=True)
-        expect_window(window=window)
-        expect_positive(sigma_depth=sigma_depth, sigma_space=sigma_space)
-        self._window, self._sigma_depth, self._sigma_space = window, sigma_depth, sigma_space
+    window: int = 19
+    sigma_depth: float = 0.03
+    sigma_space: float = 3.0
+    slopes: bool = field(default=True, init=False)
+
+    def __post_init__(self) -> None:
+        expect_window(window=self.window)
+        expect_positive(sigma_depth=self.sigma_depth, sigma_space=self.sigma_space)
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth."""
-        filtered = filter_bilateral(sample.depth_lr, self._window, self._sigma_depth, self._sigma_space)
+        filtered = filter_bilateral(sample.depth_lr, self.window, self.sigma_depth, self.sigma_space)
         if sample.scale > 1:
             return super().__call__(replace(sample, depth_lr=filtered), progress)
-        return inpaint(filtered[None])[0] if self._fill_holes else filtered
+        return inpaint(filtered[None])[0] if self.fill_holes else filtered
 
     def filter_maps(self, guided: Guided) -> Tensor:
         """Return the interpolated maps, (N, H, W); the photo is not used."""
@@ -79,6 +79,7 @@ def filter_bilateral(depth: Tensor, window: int, sigma_depth: float, sigma_space
     return torch.from_numpy(np.where(valid, filtered, np.nan))[None].to(depth)
 
 
+@dataclass(eq=False)
 class JointBilateral(GuidedMethod):
     """Joint bilateral upsampling of the low-resolution disparity.
 
@@ -93,19 +94,13 @@ class JointBilateral(GuidedMethod):
 
     abilities = replace(GuidedMethod.abilities, fast_on="cpu")
 
-    def __init__(
-        self,
-        radius: int = 2,
-        sigma_space: float = 0.5,
-        sigma_colour: float = 0.1,
-        *,
-        fill_holes: bool = False,
-        slopes: bool = True,
-    ) -> None:
-        super().__init__(fill_holes=fill_holes, slopes=slopes)
-        expect_window(radius=radius)
-        expect_positive(sigma_space=sigma_space, sigma_colour=sigma_colour)
-        self._radius, self._sigma_space, self._sigma_colour = radius, sigma_space, sigma_colour
+    radius: int = 2
+    sigma_space: float = 0.5
+    sigma_colour: float = 0.1
+
+    def __post_init__(self) -> None:
+        expect_window(radius=self.radius)
+        expect_positive(sigma_space=self.sigma_space, sigma_colour=self.sigma_colour)
 
     def filter_maps(self, guided: Guided) -> Tensor:
         """Return the weighted means of the low-resolution maps, (N, H, W)."""
@@ -133,13 +128,13 @@ class JointBilateral(GuidedMethod):
         """Yield each neighbour's exponents, (H, W), -inf in holes and outside, its rows, (H, 1), and columns, (W,)."""
         height, width = guided.valid.shape
         i, j = guided.nearest()
-        for down in range(-self._radius, self._radius + 1):
-            for across in range(-self._radius, self._radius + 1):
+        for down in range(-self.radius, self.radius + 1):
+            for across in range(-self.radius, self.radius + 1):
                 rows, columns = i + down, j + across
                 at = rows.clamp(0, height - 1)[:, None], columns.clamp(0, width - 1)
                 squares = (guided.rows - rows).square()[:, None] + (guided.columns - columns).square()
-                exponent = squares / (-2 * self._sigma_space**2)
+                exponent = squares / (-2 * self.sigma_space**2)
                 for channel, channel_lr in zip(guided.rgb, rgb_lr, strict=True):
-                    exponent -= (channel - channel_lr[at]).square() / (2 * self._sigma_colour**2)
+                    exponent -= (channel - channel_lr[at]).square() / (2 * self.sigma_colour**2)
                 inside = (rows[:, None] == at[0]) & (columns == at[1])
                 yield exponent.masked_fill_(~inside | (guided.valid[at] == 0), -torch.inf), at

@@ -5,26 +5,28 @@ Min, Choi, Lu, Ham, Sohn, Do, *Fast Global Image Smoothing Based on Weighted Lea
     sum over p of (u_p - f_p)^2 + lambda * sum over neighbours p, q of w_pq (u_p - u_q)^2,  w_pq = exp(-|I_p - I_q| / s)
 
 is approximated by solving the tridiagonal systems of all rows, then of all columns, T times, with
-lambda_t = 3/2 * 4^(T - t) / (4^T - 1) * lambda. Sparse data and their index map are both smoothed and divided, as in
-the paper: the low-resolution map at the centres of its pixels (the four high-resolution pixels around a centre that
-lies between them). What differs: lambda is in units of the squared low-resolution pixel, so that one value fits all
-scales, and far smaller than the paper's, which blurs renderings.
+lambda_t = 3/2 * 4^(T - t) / (4^T - 1) * lambda. Sparse data, the low-resolution map at the centres of its pixels, and
+their index map are both smoothed and divided, as in the paper. What differs: lambda is in squared low-resolution
+pixels, and far smaller than the paper's, which blurs renderings.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.methods.base import expect_positive
 from dsr.methods.classical.guided_filter import Guided, GuidedMethod
+from dsr.utils.guards import expect_positive
 
 # minimum smoothed confidence; below it digits are lost, and the result is the nearest low-resolution value
 _LEAST = 1e-200
 _HALF = 0.5 + 1e-6  # maximum distance, in high-resolution pixels, of data from the centre of a low-resolution pixel
 
 
+@dataclass(eq=False)
 class FastGlobalSmoother(GuidedMethod):
     """The fast global smoother of the low-resolution disparity, as sparse data.
 
@@ -36,18 +38,12 @@ class FastGlobalSmoother(GuidedMethod):
 
     """
 
-    def __init__(
-        self,
-        smoothness: float = 1.0,
-        sigma_colour: float = 0.03,
-        iterations: int = 3,
-        *,
-        fill_holes: bool = False,
-        slopes: bool = True,
-    ) -> None:
-        super().__init__(fill_holes=fill_holes, slopes=slopes)
-        expect_positive(smoothness=smoothness, sigma_colour=sigma_colour, iterations=iterations)
-        self._smoothness, self._sigma_colour, self._iterations = smoothness, sigma_colour, iterations
+    smoothness: float = 1.0
+    sigma_colour: float = 0.03
+    iterations: int = 3
+
+    def __post_init__(self) -> None:
+        expect_positive(smoothness=self.smoothness, sigma_colour=self.sigma_colour, iterations=self.iterations)
 
     def filter_maps(self, guided: Guided) -> Tensor:
         """Return the smoothed maps, (N, H, W)."""
@@ -58,18 +54,15 @@ class FastGlobalSmoother(GuidedMethod):
         ]
         data = guided.maps[:, i[:, None], j]
         index = at_centre[0][:, None] * at_centre[1] * guided.valid[i[:, None], j]
-        strength = self._smoothness * guided.scale**2
+        strength = self.smoothness * guided.scale**2
         both = torch.cat((index * data, index[None]))
-        both = smooth(guided.rgb, both, strength, self._sigma_colour, self._iterations)
+        both = smooth(guided.rgb, both, strength, self.sigma_colour, self.iterations)
         enough = both[-1] > _LEAST
         return torch.where(enough, both[:-1] / torch.where(enough, both[-1], 1), data)
 
 
 def smooth(guide: Tensor, maps: Tensor, strength: float, sigma_colour: float, iterations: int) -> Tensor:
-    """Smooth maps, (N, H, W), with the same weights where the guide, (3, H, W), is smooth.
-
-    ``strength`` is lambda in squared pixels, ``sigma_colour`` the difference of colours at which a weight is 1 / e.
-    """
+    """Smooth maps, (N, H, W), where the guide, (3, H, W), is smooth; ``strength`` is lambda in squared pixels."""
     along_rows = _weights(guide.mT, sigma_colour)  # (W - 1, H), the axis that is solved along comes first
     along_columns = _weights(guide, sigma_colour)  # (H - 1, W)
     for t in range(1, iterations + 1):

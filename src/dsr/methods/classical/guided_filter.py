@@ -2,8 +2,7 @@
 
 A guided filter is a weighted mean of low-resolution values, u_p = sum of W_pq d_q, with weights that add up to 1. With
 ``slopes``, each low-resolution pixel stands for a plane instead, u_p = sum of W_pq (d_q + s_q . (p - q)), with the
-local slope s_q of the low-resolution disparity, so that planes are reproduced exactly under any guide; ``slopes=False``
-is the filter as published. Everything is computed in float64.
+local slope s_q, so that planes are reproduced exactly; ``slopes=False`` is the filter as published.
 
 He, Sun, Tang, *Guided Image Filtering*, TPAMI 2013, with its colour guide: in every window w_k of the high-resolution
 image, q_i = a_k . I_i + b_k with
@@ -11,23 +10,24 @@ image, q_i = a_k . I_i + b_k with
     a_k = (S_k + eps U)^-1 (mean(I p) - m_k mean(p)),    b_k = mean(p) - a_k . m_k,
 
 with the mean m_k and the 3 x 3 covariance S_k of the colours I, the input p (the bilinear interpolation of the
-low-resolution map) and the identity U. The result is the mean over the windows that contain i. What differs: means over
-a window weight pixels by their confidence, so that holes do not spread, and windows by their mean confidence.
+low-resolution map) and the identity U. The result is the mean over the windows that contain i. What differs: pixels and
+windows are weighted by their confidence, so that holes do not spread.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import from_range
-from dsr.methods.base import Abilities, Cost, Method, expect_positive
+from dsr.methods.base import Abilities, Cost, Method
 from dsr.methods.images import inpaint, lr_coordinates
 from dsr.sample import DepthSample
+from dsr.utils.guards import expect_positive
 from dsr.utils.progress import Steps
 
 _WIDEST = 1024  # largest radius or width of a filter, in low-resolution pixels
@@ -61,13 +61,12 @@ class Guided:
         return rows.clamp(0, height - 1), columns.clamp(0, width - 1)
 
     def interpolate(self) -> tuple[Tensor, Tensor]:
-        """Return the maps, (N, H, W), and their confidence, (H, W), at the high-resolution pixels.
-
-        A value is the bilinear mean of the valid ones among the four low-resolution pixels around it, and its
-        confidence their bilinear weight: 1 away from holes, 0 within them, where the value is inpainted.
-        """
+        """Return the maps, (N, H, W), bilinear means of valid pixels, and the bilinear weight of these, (H, W)."""
         height, width = self.valid.shape
-        down, across = _linear_weights(self.rows, height), _linear_weights(self.columns, width)
+        down, across = (  # weights of linear interpolation; edge pixels are repeated beyond the border
+            (1 - (where.clamp(0, size - 1)[:, None] - torch.arange(size).to(where)).abs()).clamp(min=0)
+            for where, size in ((self.rows, height), (self.columns, width))
+        )
         if bool(self.valid.all()):
             return down @ self.maps @ across.T, torch.ones_like(self.rgb[0])
         confidence = (down @ self.valid @ across.T).clamp(0, 1)
@@ -75,6 +74,7 @@ class Guided:
         return torch.where(confidence > 0, mean, down @ self.maps @ across.T), confidence
 
 
+@dataclass(eq=False)
 class GuidedMethod(Method):
     """A guided filter of the low-resolution disparity: everything but :meth:`filter_maps`.
 
@@ -87,9 +87,8 @@ class GuidedMethod(Method):
 
     abilities = Abilities(ratios="any", own_size=True, cost=Cost(600, 2))
 
-    def __init__(self, *, fill_holes: bool = False, slopes: bool = True) -> None:
-        self._fill_holes = fill_holes
-        self._slopes = slopes
+    fill_holes: bool = field(default=False, kw_only=True)
+    slopes: bool = field(default=True, kw_only=True)
 
     @abstractmethod
     def filter_maps(self, guided: Guided) -> Tensor:
@@ -102,7 +101,7 @@ class GuidedMethod(Method):
         disparity_lr = sample.disparity_lr(torch.float64)[0]
         valid = disparity_lr.isfinite()
         maps = disparity_lr[None]
-        if self._slopes:  # the plane's value at row and column 0, and its slopes
+        if self.slopes:  # the plane's value at row and column 0, and its slopes
             down, across = estimate_slopes(disparity_lr, 0), estimate_slopes(disparity_lr, 1)
             i, j = (torch.arange(size).to(disparity_lr) for size in disparity_lr.shape)
             maps = torch.stack((disparity_lr - down * i[:, None] - across * j, down, across))
@@ -110,17 +109,18 @@ class GuidedMethod(Method):
         guided = Guided(sample.rgb.to(device).double(), inpaint(maps[:, None])[:, 0], valid.double(), rows, columns)
         answers = self.filter_maps(guided)
         disparity = answers[0]
-        if self._slopes:
+        if self.slopes:
             disparity = disparity + answers[1] * rows[:, None] + answers[2] * columns
         doffs = sample.camera.doffs  # disparity + doffs is inverse depth
         lowest, highest = (float(bound) + doffs for bound in disparity_lr[valid].aminmax())
         disparity = disparity.clamp(lowest / BEYOND - doffs, highest * BEYOND - doffs)
-        if not (self._fill_holes or bool(valid.all())):
+        if not (self.fill_holes or bool(valid.all())):
             row, column = guided.nearest()
             disparity = disparity.masked_fill(~valid[row[:, None], column], torch.nan)
         return from_range(disparity[None], sample.camera, "disparity").to(sample.depth_lr)
 
 
+@dataclass(eq=False)
 class GuidedFilter(GuidedMethod):
     """The guided filter of the interpolated low-resolution disparity.
 
@@ -131,26 +131,25 @@ class GuidedFilter(GuidedMethod):
 
     """
 
-    def __init__(
-        self, radius: float = 0.5, epsilon: float = 1e-3, *, fill_holes: bool = False, slopes: bool = True
-    ) -> None:
-        super().__init__(fill_holes=fill_holes, slopes=slopes)
-        expect_window(radius=radius)
-        expect_positive(epsilon=epsilon)
-        self._radius, self._epsilon = radius, epsilon
+    radius: float = 0.5
+    epsilon: float = 1e-3
+
+    def __post_init__(self) -> None:
+        expect_window(radius=self.radius)
+        expect_positive(epsilon=self.epsilon)
 
     def filter_maps(self, guided: Guided) -> Tensor:
         """Return the filtered interpolations, (N, H, W)."""
         maps, confidence = guided.interpolate()
-        radius = max(round(self._radius * guided.scale), 1)
-        return guided_filter(guided.rgb, maps, radius, self._epsilon, confidence)
+        radius = max(round(self.radius * guided.scale), 1)
+        return guided_filter(guided.rgb, maps, radius, self.epsilon, confidence)
 
 
 def guided_filter(guide: Tensor, maps: Tensor, radius: int, epsilon: float, confidence: Tensor) -> Tensor:
     """Filter maps, (N, H, W) finite, with a colour guide, (3, H, W).
 
-    Windows have (2 * radius + 1)^2 pixels, truncated at the border, and ``confidence`` weights pixels in [0, 1], (H,
-    W). A pixel in no window with a positive confidence keeps its value.
+    Windows are truncated at the border, and ``confidence``, (H, W) in [0, 1], weights pixels. A pixel in no window with
+    a positive confidence keeps its value.
     """
     mean_weight = _box(confidence, radius)
     divisor = torch.where(mean_weight > 0, mean_weight, 1)
@@ -179,9 +178,8 @@ def guided_filter(guide: Tensor, maps: Tensor, radius: int, epsilon: float, conf
 def estimate_slopes(values: Tensor, axis: int) -> Tensor:
     """Return the local slope of a map along an axis, in its shape; missing values (NaN) have slope 0.
 
-    The slope is the backward or the forward difference, whichever is closer to 0, or 0 if their signs differ; at a
-    border or a hole it is the one that exists. The median over three pixels then removes the pixel of a depth step that
-    mixes both sides.
+    It is the backward or the forward difference, whichever is closer to 0, or 0 if their signs differ; at a border or a
+    hole the one that exists. The median over three pixels then removes the pixel of a depth step that mixes both sides.
     """
     values = values.movedim(axis, 0)
     none = torch.full_like(values[:1], torch.nan)
@@ -200,12 +198,6 @@ def expect_window(**options: float) -> None:
     for name, value in options.items():
         if value > _WIDEST:
             raise ValueError(f"{name}: expected at most {_WIDEST} low-resolution pixels, got {value}")
-
-
-def _linear_weights(where: Tensor, size: int) -> Tensor:
-    """Return the weights of linear interpolation, (len(where), size); edge pixels are repeated beyond the border."""
-    places = torch.arange(size).to(where)
-    return (1 - (where.clamp(0, size - 1)[:, None] - places).abs()).clamp(min=0)
 
 
 def _box(x: Tensor, radius: int) -> Tensor:

@@ -7,6 +7,7 @@ pixels a side and does not overshoot beyond them.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 import numpy as np
@@ -25,13 +26,13 @@ from dsr.utils.progress import Steps
 Order = Literal["nearest", "bilinear", "bicubic", "clough_tocher"]
 
 
+@dataclass(eq=False)
 class Interpolation(Method):
     """Spline interpolation of low-resolution perspective depth, without a guide.
 
     ``bicubic`` is the interpolating cubic spline; ``clough_tocher`` is the smooth piecewise cubic surface over
-    triangles, which gives the scores of the "Bicubic" of Voynov et al. 2019. Both repeat the outermost
-    pixels beyond the border. Pixels are matched through the cameras, so that the pixel centres of each downsampling
-    model are respected.
+    triangles, which gives the scores of the "Bicubic" of Voynov et al. 2019. Both repeat the outermost pixels beyond
+    the border. Pixels are matched through the cameras.
 
     Args:
         order: ``nearest``, ``bilinear``, ``bicubic`` or ``clough_tocher``.
@@ -41,12 +42,13 @@ class Interpolation(Method):
     """
 
     abilities = Abilities(ratios="any", own_size=True, cost=Cost(100))
-    range_type: RangeType = "perspective"
+    range_type = "perspective"
 
-    def __init__(self, order: Order = "bicubic", *, fill_holes: bool = False) -> None:
-        expect_one_of("order", order, get_args(Order))
-        self._degree = {"nearest": 0, "bilinear": 1, "bicubic": 3, "clough_tocher": None}[order]
-        self._fill_holes = fill_holes
+    order: Order = "bicubic"
+    fill_holes: bool = field(default=False, kw_only=True)
+
+    def __post_init__(self) -> None:
+        expect_one_of("order", self.order, get_args(Order))
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution depth, (1, H, W) in metres."""
@@ -66,7 +68,7 @@ class Interpolation(Method):
             nearest = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
             values = values[tuple(nearest)]
         grid = torch.stack(torch.meshgrid(*lr_coordinates(camera_hr, camera), indexing="ij")).numpy()
-        if self._degree is None:  # over a triangulation of the pixels, the border repeated once
+        if self.order == "clough_tocher":  # over a triangulation of the pixels, the border repeated once
             from scipy.interpolate import CloughTocher2DInterpolator  # noqa: PLC0415 - only this order needs it
 
             padded = np.pad(values, 1, mode="edge")
@@ -74,13 +76,15 @@ class Interpolation(Method):
             rows, columns = (np.clip(each, -1, size) for each, size in zip(grid, values.shape, strict=True))
             range_hr = CloughTocher2DInterpolator(pixels, padded.ravel())(rows, columns)
         else:
-            range_hr = ndimage.map_coordinates(values, grid, order=self._degree, mode="nearest")
-        if not (valid.all() or self._fill_holes):
+            degree = {"nearest": 0, "bilinear": 1, "bicubic": 3}[self.order]
+            range_hr = ndimage.map_coordinates(values, grid, order=degree, mode="nearest")
+        if not (valid.all() or self.fill_holes):
             range_hr[ndimage.map_coordinates(valid.astype(np.uint8), grid, order=0, mode="nearest") == 0] = np.nan
         range_hr[range_hr <= 0] = np.nan  # a spline may overshoot beside a depth step
         return from_range(torch.from_numpy(range_hr).to(range_lr)[None], camera_hr, "perspective")
 
 
+@dataclass(eq=False)
 class CubicConvolution(Method):
     """Interpolation of low-resolution depth or disparity, without a guide.
 
@@ -90,9 +94,10 @@ class CubicConvolution(Method):
 
     abilities = Abilities(ratios="any", own_size=True)
 
-    def __init__(self, range_type: RangeType = "disparity") -> None:
-        expect_one_of("range_type", range_type, RANGE_TYPES)
-        self.range_type = range_type
+    range_type: RangeType = "disparity"
+
+    def __post_init__(self) -> None:
+        expect_one_of("range_type", self.range_type, RANGE_TYPES)
 
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
         """Return the high-resolution depth, (1, H, W) in metres."""

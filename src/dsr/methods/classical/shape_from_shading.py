@@ -8,22 +8,20 @@ Super-Resolution from Shading*, CVPR 2018, minimise
     shading = l_1 n_x + l_2 n_y + l_3 n_z + l_4,    n = m / |m|,    m = (p, q, -z - x p - y q),
 
 with z in pixels here (times the focal length, by the median depth), the slopes p = fx dz/du and q = fy dz/dv, and the
-ray (x, y, 1) of the pixel. The shading is Lambertian under first-order spherical harmonics; m faces the camera, and a
-pixel sees the area z |m| / (fx fy). With a copy theta of (p, q, z) and the scaled multiplier u, the augmented
-Lagrangian is E with theta in all terms except for the data term, plus
-penalty / 2 * (|(p, q, z) + u - theta|^2 - |u|^2). Alternating steps lower it: the albedo by region fusion
-(:mod:`dsr.methods.classical.potts`), the lighting by least squares, theta by Levenberg and Marquardt's method, z by
-conjugate gradients.
+ray (x, y, 1) of the pixel. With a copy theta of (p, q, z) and the scaled multiplier u, the augmented Lagrangian is E
+with theta in all terms except for the data term, plus penalty / 2 * (|(p, q, z) + u - theta|^2 - |u|^2). Alternating
+steps lower it: the albedo by region fusion (:func:`fuse`), the lighting by least squares, theta by Levenberg and
+Marquardt's method, z by conjugate gradients.
 
-What differs, besides the weights (the original's: data 0.0015, area 1e-7, boundary 0.5 at x4 with a focal length of 500
-pixels): each channel has its own light; the penalty of the copy of z is weighted by 1 / scale^2, because with 1 a step
-spreads over a pixel, and blocks have several; theta's 3 x 3 systems are solved in closed form, not by BFGS; it starts
-from the bicubic map, not smoothed first, which stays unchanged outside the foreground. Holes have no data term.
+What differs, besides what docs/measurements/methods.md says and the weights (the original's: data 0.0015, area 1e-7,
+boundary 0.5 at x4 with a focal length of 500 pixels): the penalty of the copy of z is weighted by 1 / scale^2; it
+starts from the bicubic map, which stays unchanged outside the foreground. Holes have no data term.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,14 +30,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.geometry.camera import RangeType
 from dsr.geometry.surface import length
-from dsr.methods.base import Abilities, Cost, Method, expect_positive, whole_scale
-from dsr.methods.classical.potts import Regions, boundary_length, fit_albedo, fuse
+from dsr.methods.base import Abilities, Cost, Method, whole_scale
 from dsr.methods.images import box_mean, inpaint, repeat_blocks, upsample_linear_border
 from dsr.sample import DepthSample
 from dsr.utils.decoding import decode_pixels
-from dsr.utils.guards import MOST_FILE, pixels_beside, read_limited
+from dsr.utils.guards import MOST_FILE, expect_positive, pixels_beside, read_limited
 from dsr.utils.progress import Steps
 
 _TINY = 1e-12  # minimum length of m, which avoids division by 0
@@ -50,6 +46,11 @@ _LESS, _MORE = 0.2, 5.0  # factors of its damping after a step that lowers the e
 _RENEW = 10  # iterations between two searches for the regions of the albedo
 _NEARER = 4.0  # factor by which a result may be nearer than the nearest valid low-resolution pixel
 _WHITE = 127  # value of a mask above which a pixel is white
+BRIGHTEST = 2.0  # maximum albedo; the minimum is 0
+_LEVELS = 5  # number of times that the weight of boundaries grows to reach its value
+_GROWTH = 4.0  # factor of its growth
+_SHUFFLE = 2654435761  # multiplier of Knuth's hash
+_RANGE = 2**32
 
 
 def compute_surface(theta: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
@@ -66,10 +67,7 @@ def compute_shading(normals: Tensor, lighting: Tensor) -> Tensor:
 
 
 def fit_lighting(rgb: Tensor, albedo: Tensor, normals: Tensor, inside: Tensor) -> Tensor:
-    """Return the lighting with the least squared error in each channel, (B, C, 4) float64.
-
-    If the normals do not determine it, as on a plane, it is the one of minimum norm. ``inside`` weights the pixels.
-    """
+    """Return the lighting with the least squared error, of several the one of minimum norm, (B, C, 4) float64."""
     ones = torch.ones_like(normals[:, :1])
     design = (torch.cat((normals, ones), dim=1) * inside)[:, None] * albedo[:, :, None]  # (B, C, 4, H, W)
     columns = design.flatten(3).double()
@@ -95,8 +93,8 @@ class ShadingProblem(NamedTuple):
 class Slopes:
     """The linear operator z -> (fx dz/du, fy dz/dv, z) / unit, and its adjoint.
 
-    Differences are forward between pixels inside the mask, backward where there is no next pixel, and 0 where there is
-    neither. Without a mask, these are the differences that :func:`dsr.geometry.surface.depth_to_normals` takes.
+    Differences are forward between pixels inside the mask, backward where there is no next pixel, else 0, without a
+    mask those of :func:`dsr.geometry.surface.depth_to_normals`.
     """
 
     def __init__(self, problem: ShadingProblem) -> None:
@@ -173,12 +171,19 @@ class ShadingSolver:
 
     def update_depth(self) -> None:
         """Lower the Lagrangian, which is quadratic in z, by conjugate gradients from the current z."""
+
+        def curvature(z: Tensor) -> Tensor:  # the second derivative in z, times z; 0 outside the mask
+            inside = self._weight * z
+            own = self.penalty * self.slopes.adjoint(self.coupling * self.slopes(inside))
+            return self._weight * (own + data_weight * self._block_means_adjoint(self._block_means(inside)))
+
+        data_weight = self.problem.data_weight
         wanted = self.theta - self.missed - self.slopes(self.z)
         right = self._weight * (
-            self.problem.data_weight * self._block_means_adjoint(self._lr - self._block_means(self.z))
+            data_weight * self._block_means_adjoint(self._lr - self._block_means(self.z))
             + self.penalty * self.slopes.adjoint(self.coupling * wanted)
         )
-        self.z = self.z + conjugate_gradients(self._normal_operator, right, _CG_ITERATIONS, _CG_TOLERANCE)
+        self.z = self.z + conjugate_gradients(curvature, right, _CG_ITERATIONS, _CG_TOLERANCE)
 
     def update_missed(self, growth: float) -> None:
         """Add (p, q, z) - theta to the multiplier, and multiply the penalty."""
@@ -231,12 +236,6 @@ class ShadingSolver:
         hessian = torch.cat(triangle, dim=1) * self._weight
         hessian[:, [0, 3, 5]] += self.penalty * self.coupling
         return gradient, hessian
-
-    def _normal_operator(self, z: Tensor) -> Tensor:
-        """Return the second derivative of the Lagrangian in z, times z; 0 outside the mask."""
-        inside = self._weight * z
-        own = self.penalty * self.slopes.adjoint(self.coupling * self.slopes(inside))
-        return self._weight * (own + self.problem.data_weight * self._block_means_adjoint(self._block_means(inside)))
 
     def _block_means(self, z: Tensor) -> Tensor:
         return torch.where(self._valid, box_mean(z, self.scale), 0)
@@ -302,11 +301,11 @@ def conjugate_gradients(
     return x
 
 
+@dataclass(eq=False)
 class ShapeFromShading(Method):
     """Variational super-resolution from shading.
 
-    Holes of the input are inpainted. Memory: about 130 float64 maps of the image's size. The low-resolution map is
-    assumed to hold block means of depth.
+    Holes of the input are inpainted. The low-resolution map is assumed to hold block means of depth.
 
     Args:
         iterations: maximum number of iterations.
@@ -326,31 +325,25 @@ class ShapeFromShading(Method):
     """
 
     abilities = Abilities(fast_on="cpu", cost=Cost(1300, 60))
-    range_type: RangeType = "orthogonal"
+    range_type = "orthogonal"
 
-    def __init__(
-        self,
-        iterations: int = 40,
-        tolerance: float = 1e-4,
-        data_weight: float = 100.0,
-        area_weight: float = 0.2,
-        boundary_weight: float = 0.1,
-        penalty: float = 0.02,
-        growth: float = 1.3,
-        foreground: str | None = None,
-    ) -> None:
-        expect_positive(iterations=iterations)
-        expect_positive(or_zero=True, tolerance=tolerance, area_weight=area_weight)
-        if not 1 <= growth < float("inf"):
-            raise ValueError(f"growth: expected at least 1, got {growth}")
-        expect_positive(data_weight=data_weight, boundary_weight=boundary_weight, penalty=penalty)
-        if foreground is not None and not Path(foreground).is_dir():
-            raise ValueError(f"foreground: expected a folder of masks, there is none at {foreground}")
-        self.iterations, self.tolerance = iterations, tolerance
-        self.data_weight, self.area_weight, self.boundary_weight = data_weight, area_weight, boundary_weight
-        self.penalty, self.growth = penalty, growth
-        self.foreground = None if foreground is None else Path(foreground)
-        self.history: list[dict[str, float]] = []
+    iterations: int = 40
+    tolerance: float = 1e-4
+    data_weight: float = 100.0
+    area_weight: float = 0.2
+    boundary_weight: float = 0.1
+    penalty: float = 0.02
+    growth: float = 1.3
+    foreground: str | None = None
+
+    def __post_init__(self) -> None:
+        expect_positive(iterations=self.iterations, penalty=self.penalty)
+        expect_positive(data_weight=self.data_weight, boundary_weight=self.boundary_weight)
+        expect_positive(or_zero=True, tolerance=self.tolerance, area_weight=self.area_weight)
+        if not 1 <= self.growth < float("inf"):
+            raise ValueError(f"growth: expected at least 1, got {self.growth}")
+        if self.foreground is not None and not Path(self.foreground).is_dir():
+            raise ValueError(f"foreground: expected a folder of masks, there is none at {self.foreground}")
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
@@ -388,7 +381,8 @@ class ShapeFromShading(Method):
         camera = sample.camera
         inside = torch.ones(1, 1, camera.height, camera.width, dtype=torch.bool, device=lr.device)
         if self.foreground is not None:
-            mask = read_foreground(self.foreground / f"{sample.scene}.png", (camera.height, camera.width))
+            path = Path(self.foreground) / f"{sample.scene}.png"
+            mask = read_foreground(path, (camera.height, camera.width))
             inside = torch.from_numpy(mask)[None, None].to(lr.device)
         unit = (camera.fx * camera.fy) ** 0.5
         metres = float(lr[lr.isfinite()].median()) / unit
@@ -420,3 +414,133 @@ def read_foreground(path: Path, size: tuple[int, int]) -> np.ndarray:
     if not (levels > _WHITE).any():
         raise ValueError(f"{path}: expected a foreground in white, got a black mask")
     return levels > _WHITE
+
+
+class Regions(NamedTuple):
+    """A partition: ``labels`` (B, H, W) int64, from 0 to ``number`` - 1, different in each image."""
+
+    labels: Tensor
+    number: int
+
+
+class _Borders(NamedTuple):
+    """Pairs of neighbouring regions, (N,) each: both labels, and the length of the boundary between them."""
+
+    one: Tensor
+    other: Tensor
+    length: Tensor
+
+
+def fuse(rgb: Tensor, shading: Tensor, weight: float, inside: Tensor) -> Regions:
+    """Return regions of a piecewise constant albedo of which no fusion of two lowers E, equal for equal input.
+
+    E = 1/2 sum (rgb - albedo * shading)^2 + weight * (number of pairs of neighbours in different regions), the Potts
+    problem. As in Nguyen and Brown (*Fast and Effective L0 Gradient Minimization by Region Fusion*, ICCV 2015), from
+    one region per pixel, two neighbours are fused if this costs less than the boundary between them, whose weight grows
+    to its value in a few levels. Many are fused at once, in disjoint groups, and only if this lowers E.
+
+    Image and shading are (B, C, H, W) float64, ``weight`` is that of a unit of boundary length, and ``inside`` the mask
+    (B, 1, H, W) of the problem; each pixel outside is a region of its own.
+    """
+    batch, channels, height, width = rgb.shape
+    labels = torch.arange(batch * height * width, device=rgb.device)
+    squares, products = (each.movedim(1, -1).reshape(-1, channels) for each in (shading.square(), shading * rgb))
+    borders = _find_borders(labels.reshape(batch, height, width), inside)
+    turn = 0
+    for level in range(_LEVELS, -1, -1):
+        price = weight / _GROWTH**level
+        while (parent := _choose_fusions(squares, products, borders, price, turn)) is not None:
+            turn += 1
+            roots = parent == torch.arange(len(parent), device=parent.device)
+            joined = ~roots
+            squares = squares.index_add(0, parent[joined], squares[joined])[roots]
+            products = products.index_add(0, parent[joined], products[joined])[roots]
+            renamed = (roots.cumsum(0) - 1)[parent]
+            labels = renamed[labels]
+            one, other = renamed[borders.one], renamed[borders.other]
+            apart, count = one != other, len(squares)
+            low, high = torch.minimum(one, other)[apart], torch.maximum(one, other)[apart]
+            keys, places = torch.unique(low * count + high, return_inverse=True)  # each pair of regions once
+            length = torch.zeros_like(keys).index_add_(0, places, borders.length[apart])
+            borders = _Borders(keys // count, keys % count, length)
+    return Regions(labels.reshape(batch, height, width), len(squares))
+
+
+def fit_albedo(rgb: Tensor, shading: Tensor, regions: Regions) -> Tensor:
+    """Return the best albedo that is constant in each region, (B, C, H, W)."""
+    channels, flat = rgb.shape[1], regions.labels.reshape(-1)
+    squares, products = (
+        each.new_zeros(regions.number, channels).index_add_(0, flat, each.movedim(1, -1).reshape(-1, channels))
+        for each in (shading.square(), shading * rgb)
+    )
+    return _best_albedo(squares, products)[regions.labels].movedim(-1, 1)
+
+
+def boundary_length(regions: Regions, inside: Tensor) -> int:
+    """Return the number of pairs of neighbours in different regions, both inside the mask (B, 1, H, W)."""
+    borders = _find_borders(regions.labels, inside)
+    return int((borders.one != borders.other).sum())
+
+
+def _best_albedo(squares: Tensor, products: Tensor) -> Tensor:
+    """Return the best albedo by the sums of shading^2 and shading * rgb, (count, C) each; 0 without shading."""
+    best = products / torch.where(squares > 0, squares, 1)
+    return torch.where(squares > 0, best, 0).clamp(0, BRIGHTEST)
+
+
+def _worth(squares: Tensor, products: Tensor) -> Tensor:
+    """Return the decrease of the data term from albedo 0 to the best albedo, (count,)."""
+    albedo = _best_albedo(squares, products)
+    return ((products - 0.5 * squares * albedo) * albedo).sum(dim=1)
+
+
+def _find_borders(labels: Tensor, inside: Tensor) -> _Borders:
+    """Return a border of length 1 for each pair of neighbouring pixels inside."""
+    ends = []
+    for dim in (-1, -2):
+        size = labels.shape[dim] - 1
+        both = inside[:, 0].narrow(dim, 0, size) & inside[:, 0].narrow(dim, 1, size)
+        ends.append(torch.stack((labels.narrow(dim, 0, size)[both], labels.narrow(dim, 1, size)[both])))
+    one, other = torch.cat(ends, dim=1)
+    return _Borders(one, other, torch.ones_like(one))
+
+
+def _choose_fusions(squares: Tensor, products: Tensor, borders: _Borders, price: float, turn: int) -> Tensor | None:
+    """Return the region that each region is fused into, (count,), or None if no fusion of two lowers E."""
+    one, other, length = borders
+    worth, count = _worth(squares, products), len(squares)
+    cost = (worth[one] + worth[other] - _worth(squares[one] + squares[other], products[one] + products[other])) / length
+    cheap = cost < price
+    if not bool(cheap.any()):
+        return None
+    leaf, centre = torch.cat((one, other))[cheap.repeat(2)], torch.cat((other, one))[cheap.repeat(2)]
+    length, cost = length[cheap].repeat(2), cost[cheap].repeat(2)
+    # a hash splits regions into centres and those that may join their best neighbour, if it is a centre
+    joining = (_hash(torch.arange(count, device=one.device) + turn * count) & 1).bool()
+    kept = ~joining[leaf] & joining[centre]
+    leaf, centre, length, cost = leaf[kept], centre[kept], length[kept], cost[kept]
+    kept = _is_cheapest(leaf, cost, count)
+    leaf, centre, length, cost = leaf[kept], centre[kept], length[kept], cost[kept]
+    union = squares.index_add(0, centre, squares[leaf]), products.index_add(0, centre, products[leaf])
+    lost = worth.index_add(0, centre, worth[leaf]) - _worth(*union)
+    saved = torch.zeros_like(worth).index_add_(0, centre, price * length.to(worth))
+    # if all fusions of a centre together cost more than the boundaries, it only takes its best neighbour
+    joins = (lost < saved)[centre] | _is_cheapest(centre, cost, count)
+    parent = torch.arange(count, device=one.device)
+    parent[leaf[joins]] = centre[joins]
+    return parent
+
+
+def _is_cheapest(owner: Tensor, cost: Tensor, count: int) -> Tensor:
+    """Return the mask of the cheapest entry of each owner; ties are broken by a hash."""
+    least = cost.new_full((count,), torch.inf).scatter_reduce_(0, owner, cost, "amin")
+    number = torch.where(cost == least[owner], _hash(torch.arange(len(owner), device=owner.device)), _RANGE)
+    return number == torch.full((count,), _RANGE, device=owner.device).scatter_reduce_(0, owner, number, "amin")[owner]
+
+
+def _hash(number: Tensor) -> Tensor:
+    """Return pseudo-random integers below 2^32; the map is one-to-one below 2^32."""
+    for _ in range(2):
+        number = (number * _SHUFFLE) % _RANGE
+        number = number ^ (number >> 15)
+    return number

@@ -11,16 +11,15 @@ of Chambolle and Pock (2011), with the diagonal step sizes of Pock and Chambolle
 over-relaxed (Condat 2013, algorithm 3.1).
 
 What differs: a low-resolution pixel d is the mean of u over its block of w pixels, not the value of one high-resolution
-pixel; without a finite ``data_weight`` its proximal map is a projection, and block means equal the input exactly. It
-works on disparity, normalised by its range. Differences beyond the border are left out; the original sets them to 0,
-which bends planes. It starts from the bicubic map and its gradient, one with holes from its own solution at the low
-resolution, because a hole is filled one pixel per iteration. alpha_0 is 2.4 instead of 17: on procedural scenes,
-renderings are better by a quarter, and convergence is faster.
+pixel. It works on disparity, normalised by its range. Differences beyond the border are left out; the original sets
+them to 0, which bends planes. It starts from the bicubic map and its gradient, one with holes from its own solution at
+the low resolution. alpha_0 is 2.4 instead of 17.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import torch
@@ -28,7 +27,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import from_range
-from dsr.methods.base import Abilities, Cost, Method, expect_positive, whole_scale
+from dsr.methods.base import Abilities, Cost, Method, whole_scale
 from dsr.methods.images import (
     box_mean,
     estimate_sensor_noise,
@@ -39,6 +38,7 @@ from dsr.methods.images import (
     upsample_linear_border,
 )
 from dsr.sample import DepthSample
+from dsr.utils.guards import expect_positive
 from dsr.utils.progress import Steps, ignore
 
 _CHECK_EVERY = 50  # iterations between two checks of how far the map has moved
@@ -69,11 +69,11 @@ class Solution(NamedTuple):
     moved: list[float]  # RMS movement of u between two checks
 
 
+@dataclass(eq=False)
 class TotalGeneralisedVariation(Method):
     """TGV-guided upsampling.
 
-    Holes of the input are inpainted. Memory: about 90 float64 maps of the image's size, 180 MB for 512 x 512. The
-    low-resolution map is assumed to hold block means of disparity, whatever the downsampling model was.
+    Holes of the input are inpainted. The low-resolution map is assumed to hold block means of disparity.
 
     Args:
         iterations: maximum number of iterations.
@@ -90,27 +90,23 @@ class TotalGeneralisedVariation(Method):
 
     abilities = Abilities(ratios="whole", cost=Cost(800, 60))
 
-    def __init__(
-        self,
-        iterations: int = 1000,
-        tolerance: float = 1e-4,
-        first: float = 1.2,
-        second: float = 2.4,
-        data_weight: float | Literal["auto"] | None = None,
-        sharpness: float = 9.0,
-        exponent: float = 0.85,
-        step_ratio: float = 1e4,
-    ) -> None:
-        expect_positive(iterations=iterations, first=first, second=second, exponent=exponent, step_ratio=step_ratio)
-        expect_positive(or_zero=True, tolerance=tolerance, sharpness=sharpness)
-        if data_weight not in (None, "auto"):
-            if isinstance(data_weight, str):
-                raise ValueError(f"data_weight: expected a number, auto or None, got {data_weight!r}")
-            expect_positive(data_weight=data_weight)
-        self.iterations, self.tolerance = iterations, tolerance
-        self.alpha1, self.alpha0, self.data_weight = first, second, data_weight
-        self.sharpness, self.exponent, self.step_ratio = sharpness, exponent, step_ratio
-        self.history: list[dict[str, float]] = []
+    iterations: int = 1000
+    tolerance: float = 1e-4
+    first: float = 1.2
+    second: float = 2.4
+    data_weight: float | Literal["auto"] | None = None
+    sharpness: float = 9.0
+    exponent: float = 0.85
+    step_ratio: float = 1e4
+
+    def __post_init__(self) -> None:
+        expect_positive(iterations=self.iterations, first=self.first, second=self.second)
+        expect_positive(exponent=self.exponent, step_ratio=self.step_ratio)
+        expect_positive(or_zero=True, tolerance=self.tolerance, sharpness=self.sharpness)
+        if self.data_weight not in (None, "auto"):
+            if isinstance(self.data_weight, str):
+                raise ValueError(f"data_weight: expected a number, auto or None, got {self.data_weight!r}")
+            expect_positive(data_weight=self.data_weight)
 
     @torch.inference_mode()
     def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
@@ -152,8 +148,8 @@ class TotalGeneralisedVariation(Method):
             prox_v = v + step_v * (gp[:, :, 0] + divergence(q))
             ahead_u, ahead_v = 2 * prox_u - u, 2 * prox_v - v
             bent = g.times(_zero_border(gradient(ahead_u) - ahead_v[:, :, None]))
-            prox_p = _project_ball(p + step_p * bent, self.alpha1)
-            prox_q = _project_ball(q + step_q * gradient(ahead_v), self.alpha0)
+            prox_p = _project_ball(p + step_p * bent, self.first)
+            prox_q = _project_ball(q + step_q * gradient(ahead_v), self.second)
             u, v = u.lerp(prox_u, _RELAXATION), v.lerp(prox_v, _RELAXATION)
             p, q = p.lerp(prox_p, _RELAXATION), q.lerp(prox_q, _RELAXATION)
             since = (done - 1) % _CHECK_EVERY + 1
@@ -170,9 +166,8 @@ class TotalGeneralisedVariation(Method):
     def choose_weight(self, lr: Tensor, scale: int) -> float | None:
         """Return the weight of the data term for a normalised map, (B, 1, h, w), NaN in holes.
 
-        With ``auto``, the weight is inversely proportional to the standard deviation s of the map's noise, at which the
-        data term and the regulariser change alike if everything is scaled: 0.6 / (s scale). It is None above 1000,
-        where the block means are nearly the input. 0.6 gives 30 for a Kinect at x4, which suited a living room.
+        With ``auto``, it is 0.6 / (s scale) for noise of the standard deviation s: the data term and the regulariser
+        change alike if everything is scaled. It is None above 1000, where the block means are nearly the input.
         """
         if self.data_weight != "auto":
             return self.data_weight
@@ -213,10 +208,7 @@ def divergence(p: Tensor) -> Tensor:
 
 
 def sum_adjacent(p: Tensor, sign: int = 1) -> Tensor:
-    """Return the sum of the values at the differences that use each pixel, (B, 2, C, H, W) -> (B, C, H, W).
-
-    At its second pixel, a value has the sign. The last column of p along u and its last row along v are ignored.
-    """
+    """Return at each pixel the sum of p for the differences that use it, (B, C, H, W), by ``sign`` at the second."""
     total = torch.zeros_like(p[:, 0])
     for direction, dim in ((0, -1), (1, -2)):
         count = p.shape[dim] - 1

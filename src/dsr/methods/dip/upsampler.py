@@ -9,8 +9,8 @@ low-resolution version D d is compared with the input d_LR, and the intensity of
 with the range r of the input, and c = 10 for MSE, 1 for Lap_1. Holes of the input have no data term; the network fills
 them. The result is a moving average of the depth maps of all steps.
 
-The network is the hourglass of Ulyanov et al., supplementary material. What differs: convolutions are padded with
-zeros, the last one always computes in float32, and the widths may differ between levels.
+The network is the hourglass of Ulyanov et al. What differs: convolutions are padded with zeros, the last one always
+computes in float32, and the widths may differ between levels.
 """
 
 from __future__ import annotations
@@ -32,13 +32,14 @@ from torch.utils.data import DataLoader
 
 from dsr.degradation.downsampling import Downsampling, downsample_depth, scene_generator
 from dsr.geometry.surface import comparison, depth_to_normals
-from dsr.methods.base import WORKSPACE, Abilities, Cost, Method, expect_positive, whole_scale
+from dsr.methods.base import WORKSPACE, Abilities, Cost, Method, whole_scale
 from dsr.methods.images import compute_min_max, estimate_noise, grey, mean3x3, normal_noise_deg
 from dsr.methods.networks.network import DTYPES, Precision
 from dsr.metrics.classes import compute_means, in_table_units
 from dsr.metrics.functional import SurfacePair, rmse_v
 from dsr.metrics.losses import VisualLossName, lap1, make_visual_loss, match_weight, mse
 from dsr.sample import DepthSample
+from dsr.utils.guards import expect_positive
 from dsr.utils.lightning import ScoreTables, StepProgress, fit, make_trainer
 from dsr.utils.progress import Progress, Steps, StepsProgress
 from dsr.utils.runs_table import list_run
@@ -98,7 +99,6 @@ class DeepImagePrior(Method):
     lpips_trunk: str | Path | None = None
 
     def __post_init__(self) -> None:
-        """Check the options, and load the network of LPIPS."""
         self.device = torch.device(self.device)
         w = 1.0 if self.w == "auto" else self.w
         expect_positive(steps=self.steps, learning_rate=self.learning_rate)
@@ -152,14 +152,10 @@ class DeepImagePrior(Method):
                 logger.log_hyperparams(settings)
                 list_run(logger.experiment, "optimisation", settings, {})
             trainer = make_trainer(
-                torch.device(self.device),
-                self.steps,
-                min(self.validate_every or self.steps, self.steps),
-                callbacks=callbacks,
-                logger=logger,
-                limit_val_batches=1 if self.validate_every else 0,
+                torch.device(self.device), self.steps, min(self.validate_every or self.steps, self.steps),
+                callbacks=callbacks, logger=logger, limit_val_batches=1 if self.validate_every else 0,
                 enable_checkpointing=False,
-            )
+            )  # fmt: skip
             fit(trainer, module, _numbers(self.steps), val_dataloaders=_numbers(1))
         return module.best[0].to(sample.depth_lr)
 
@@ -300,9 +296,8 @@ def _numbers(count: int) -> Any:
 class SkipNet(nn.Module):
     """An hourglass with narrow skip connections, of given channels at each level, full resolution first.
 
-    In the encoder, each level halves the resolution by a strided 3 x 3 convolution, followed by another one. In the
-    decoder, each level doubles it bilinearly, concatenates the skip connection and applies a 3 x 3 and a 1 x 1
-    convolution. Batch normalisation over the image and a leaky ReLU follow every convolution.
+    In the decoder, each level doubles the resolution bilinearly, concatenates the skip connection and applies a 3 x 3
+    and a 1 x 1 convolution. Batch normalisation over the image and a leaky ReLU follow every convolution.
     """
 
     def __init__(self, inputs: int, outputs: int, widths: Sequence[int], skips: Sequence[int]) -> None:

@@ -6,8 +6,7 @@ github.com/neycyanshi/DDRNet. Both maps are compared with the reference depth, a
 photo (:func:`dsr.training.objective.shading_loss`).
 
 What differs: the input is the bicubic upsampling of a low-resolution map, exact on planes, of disparity normalised to
--1..1; the refinement network learns a residual, too; the sizes are halved at most as often as the scale can be, once at
-x2 and twice otherwise, so that tiles of low-resolution pixels keep them aligned.
+-1..1; the refinement network learns a residual, too; the sizes are halved once at x2 and twice otherwise.
 """
 
 from __future__ import annotations
@@ -29,8 +28,6 @@ _UPSAMPLING = 4  # receptive-field radius of the upsampling in low-resolution pi
 
 class DDRNet(NormalisedNetwork):
     """The network.
-
-    Memory: about 1300 bytes for each pixel of the photo, or of a window.
 
     Args:
         scale: upsampling factor, 2, 4, 8 or 16.

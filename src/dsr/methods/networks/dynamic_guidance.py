@@ -7,9 +7,8 @@ the gradient of sum over l of w_l(g) rho_l(k_l y), the weighted responses of fil
     y = x - fidelity * U(A x - d),    x = y - sum over l of k_l' (w_l(g) rho_l'(k_l y)),
     w_l(g) = exp(-sum over m of c_lm (b_m * g)^2),    rho_l(z) = sum over j of a_j tau_j^2 / 2 log(1 + z^2 / tau_j^2).
 
-What differs: the k_l have unit norm and response 0 on a plane, so that planes are reproduced under any image g; rho_l
-is a mixture of Lorentzians (Roth and Black, IJCV 2009), there of Gaussian radial basis functions; the data step is
-iterative back-projection (Irani and Peleg 1991); the form of w_l is ours; all stages are trained at once, on disparity.
+What differs, besides what docs/measurements/methods.md says: the k_l have unit norm; rho_l is a mixture of Lorentzians
+(Roth and Black, IJCV 2009), the data step iterative back-projection (Irani and Peleg 1991), the form of w_l is ours.
 """
 
 from __future__ import annotations
@@ -37,8 +36,7 @@ _BICUBIC = 2  # half width of the bicubic kernel in low-resolution pixels
 def polynomial_filters(size: int) -> Tensor:
     """Return an orthonormal basis of filters, ordered by degree: 1, u, v, ...; float64 (size^2, size, size).
 
-    They are products of two discrete orthogonal (Gram) polynomials, one along v and one along u. Without the first
-    filter, they have response 0 to constants, without the first three to planes.
+    They are products of two discrete orthogonal (Gram) polynomials; those after the third have response 0 to planes.
     """
     with torch.inference_mode(mode=False):  # the cached tensors may later be used with gradients
         x = torch.linspace(-1, 1, size, dtype=torch.float64)

@@ -1,12 +1,10 @@
 """Facets: guided super-resolution by a mixture of planes, dsr's own network.
 
-Convolutions that predict disparity pixel by pixel leave a faint texture on smooth surfaces. The disparity of a plane
-is linear in the pixel, so this network predicts planes. Each low-resolution pixel proposes a few ("facets"), built
-from the differences to its neighbours. Each high-resolution pixel mixes the planes of the 3 x 3 low-resolution pixels
-around it, extended to its position, with weights predicted from the colour image. Whatever the weights are, planes are
-reproduced exactly, the network commutes with an affine map of the disparity, and the result does not overshoot the
-extended planes, which differ from the differences by at most a multiple of the local *bend*, the largest second
-difference around a pixel.
+The disparity of a plane is linear in the pixel, so this network predicts planes. Each low-resolution pixel proposes a
+few ("facets"), built from the differences to its neighbours. Each high-resolution pixel mixes the planes of the 3 x 3
+low-resolution pixels around it, extended to its position, with weights predicted from the colour image. Whatever the
+weights are, planes are reproduced exactly, the network commutes with an affine map of the disparity, and the result
+does not overshoot the extended planes.
 
 Below it are the layers that it shares with :mod:`dsr.methods.networks.facets_unet`, which can start from its weights.
 """
@@ -132,9 +130,8 @@ def enlarge_and_join(up: nn.Conv2d, join: nn.Conv2d, x: Tensor, features: Tensor
     """Return a 3 x 3 convolution of the sub-pixel shuffle of a 1 x 1 convolution's results, with features behind them.
 
     Both convolutions are linear: in float32 and above, their effect on ``x`` is computed as one transposed convolution,
-    without the arrays between them. The bias of the first becomes the weight of a channel of ones, which, like all
-    others, has no effect beyond the border. In lower precisions, whose matrix products prefer even numbers of channels,
-    that would be slower and less exact.
+    in which the bias of the first is the weight of a channel of ones. In lower precisions that would be slower and less
+    exact.
     """
     if exporting() or x.dtype.itemsize < torch.float32.itemsize:  # a graph has to know the weights of a convolution
         enlarged: Tensor = functional.pixel_shuffle(up(x), 2)

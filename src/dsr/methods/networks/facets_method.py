@@ -36,8 +36,7 @@ SPECIAL: Mapping[tuple[Kernel | None, Edges], tuple[Literal["clean", "soft"], fl
     {("box", "sharp"): ("clean", 0.85), ("bicubic", "soft"): ("soft", CAUTION)}
 )
 # Relative error of depth in holes that the network does not expect, per degree from the nearest measured pixel. On
-# Middlebury 2014 and ICL-NUIM with holes cut into them it expects 2 % everywhere, and depth is off by 3 % at 0.5 to 1
-# degree and by 4 % at 1 to 3 degrees.
+# Middlebury 2014 and ICL-NUIM with holes cut into them it expects 2 %, and depth is off by 4 % at 1 to 3 degrees.
 _PER_DEGREE = 0.012
 _ROUNDED = 16  # a map with fewer different values than one per so many pixels may be a rounded one
 # Share of a level's borders that it has at least with the next nearer and with the next farther level, largest ratio of
@@ -155,7 +154,11 @@ class AnyMap(Method):
             return _resize(error, (height, width))[0].to(depth)
 
         focal = sample.camera_lr.fx
-        rounding, tilt, guessing = (each.to(depth) for each in (*_rounding(inverse, focal), _guessing(inverse, focal)))
+        known, guessing = inverse.isfinite(), torch.zeros_like(inverse)  # in holes beyond what the network expects
+        if not bool(known.all()):
+            away = torch.stack([distance_to_known(each) for each in known])
+            guessing = (_PER_DEGREE * degrees_per_pixel(focal) * away).clamp(max=1)
+        rounding, tilt, guessing = (each.to(depth) for each in (*_rounding(inverse, focal), guessing))
         spread = torch.maximum(self._caution * fit(answer.spread[inside]), fit(rounding)) + fit(guessing)
         angle = torch.maximum(self._caution * fit(answer.angle[inside]), fit(tilt))
         depth_error = spread * depth
@@ -185,24 +188,22 @@ def _describe_noise(given: Tensor, answer: Answer) -> MapNoise:
     error = (error - (error * known).sum() / count) * known
     variance = error.square().sum() / count
     depth = given[given.isfinite()].median().reciprocal()
-    return MapNoise(float(variance.sqrt() * depth), _extent(error, known, float(variance)), float(depth))
-
-
-def _guessing(inverse: Tensor, focal: float) -> Tensor:
-    """Return the relative error of depth in holes beyond what the network expects, by distance, (B, 1, h, w)."""
-    known = inverse.isfinite()
-    if bool(known.all()):
-        return torch.zeros_like(inverse)
-    distance = torch.stack([distance_to_known(each) for each in known])
-    return (_PER_DEGREE * degrees_per_pixel(focal) * distance).clamp(max=1)
+    before, extent = 1.0, 2.0 * 16  # the full width at half maximum of the correlation of neighbours, in pixels
+    for step in range(1, min(16, error.shape[-1])):
+        both = (known[..., step:] * known[..., :-step]).sum().clamp(min=1)
+        now = float((error[..., step:] * error[..., :-step]).sum() / both) / max(float(variance), 1e-20)
+        if now < 0.5:
+            extent = max(1.0, 2 * (step - 1 + (before - 0.5) / max(before - now, 1e-6)))
+            break
+        before = now
+    return MapNoise(float(variance.sqrt() * depth), extent, float(depth))
 
 
 def _rounding(inverse: Tensor, focal: float) -> tuple[Tensor, Tensor]:
     """Return the expected errors of maps rounded to few values, (B, 1, h, w), 0 where the values around a pixel differ.
 
-    That of depth is relative: a quarter of the step to the next value, the mean of errors that are equally likely up to
-    half a step. That of the normal, in radians, is the tilt of a surface that gains it up to the next other value. A
-    rounded slope is a staircase; its largest relative step, twice, limits those of single levels.
+    That of depth is relative, a quarter of the step to the next value, that of the normal, in radians, the tilt of a
+    surface that gains it up to the next other value.
     """
     nothing, known = torch.zeros_like(inverse), inverse.isfinite()
     values = inverse[known].unique()
@@ -222,25 +223,13 @@ def _rounding(inverse: Tensor, focal: float) -> tuple[Tensor, Tensor]:
     stairs = (larger <= _EVEN * smaller) & (torch.minimum(above[1:-1], above[:-2]) > _STAIR * borders[1:-1])
     if stairs.sum() < _STAIRS:
         return nothing, nothing
-    step = torch.cat((gaps[:1], smaller, gaps[-1:])) / values
+    step = torch.cat((gaps[:1], smaller, gaps[-1:])) / values  # of single levels at most _EXCESS of a staircase's
     relative = (step.clamp(max=_EXCESS * step[1:-1][stairs].max()) / 4)[level]
     low = -functional.max_pool2d(-torch.where(known, inverse, torch.inf), 3, stride=1, padding=1)
     high = functional.max_pool2d(torch.where(known, inverse, -torch.inf), 3, stride=1, padding=1)
     flat = known & (low == high)
     away = torch.stack([distance_to_known(each) for each in ~flat])
     return torch.where(flat, relative, 0), torch.where(flat, torch.atan(focal * relative / (away + 1)), 0)
-
-
-def _extent(error: Tensor, known: Tensor, variance: float) -> float:
-    """Return the full width at half maximum of the correlation of neighbours, in pixels, 1 for white noise."""
-    before = 1.0
-    for step in range(1, min(16, error.shape[-1])):
-        both = (known[..., step:] * known[..., :-step]).sum().clamp(min=1)
-        now = float((error[..., step:] * error[..., :-step]).sum() / both) / max(variance, 1e-20)
-        if now < 0.5:
-            return max(1.0, 2 * (step - 1 + (before - 0.5) / max(before - now, 1e-6)))
-        before = now
-    return 2.0 * 16
 
 
 def _resize(x: Tensor, size: tuple[int, int]) -> Tensor:

@@ -50,8 +50,7 @@ def stencil(values: Tensor) -> Stencil:
 def smooth(values: Tensor, weight: Tensor, levels: int) -> list[Tensor]:
     """Return copies of a map, (B, 1, h, w), smoothed more and more: binomial kernels 1, 2, 4, ... pixels apart.
 
-    Planes stay planes where nothing was filled in: ``weight`` (B, 1, h, w) is 1 where the map is known and 0 where it
-    was filled in, which counts a tenth.
+    ``weight`` (B, 1, h, w) is 1 where the map is known and 0 where it was filled in, which counts a tenth.
     """
     weight = 0.1 + 0.9 * weight
     found = []
@@ -70,10 +69,7 @@ def smooth(values: Tensor, weight: Tensor, levels: int) -> list[Tensor]:
 
 
 def average_planes(planes: Tensor, weights: Tensor, reach: int) -> Tensor:
-    """Return averages of planes, extended to each pixel, ``reach`` pixels apart or less at the border.
-
-    ``planes`` are (B, facets, 3, h, w), ``weights`` (B, facets, 9, h, w), row by row.
-    """
+    """Return means of planes (B, facets, 3, h, w) ``reach`` pixels apart, by weights (B, facets, 9, h, w)."""
     if exporting():
         near = _extend_to_centre(_repeat_border(planes, reach), planes.shape, reach)
         return (weights.unflatten(2, (3, 3))[:, :, None] * near).sum(dim=(3, 4))
@@ -152,10 +148,9 @@ def _distances_along(size: int, reach: int, dtype: torch.dtype, device: torch.de
 def mix_planes(planes: Tensor, found: Tensor, scale: int) -> tuple[Tensor, Tensor]:
     """Return the mixture of the planes around each high-resolution pixel, (B, 1, H, W), and the other channels.
 
-    What is mixed are the differences to the first plane of the pixel's own low-resolution pixel, in the type of
-    ``found``, at least float32; that plane is added in the type of ``planes``, in which it is reproduced exactly.
     ``planes`` are (B, facets, 3, h, w), ``found`` (B, 9 * facets + n, H, W): logits, to which those of a quadratic
-    B-spline are added, and n more channels, which are returned in at least float32.
+    B-spline are added, and n more channels. What is mixed, in at least float32, are the differences to the first plane
+    of the pixel's own low-resolution pixel, which is added in the type of ``planes``.
     """
     batch, facets, _, height, width = planes.shape
     count = NEIGHBOURS * facets

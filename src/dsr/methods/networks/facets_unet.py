@@ -5,9 +5,7 @@ sees the low-resolution grid down to an eighth of its size. Planes choose among 
 it, and are averaged with those around them in five steps of 1 to 16 pixels. The roughness of the map and the hints
 scale and shift the features of each block (Perez et al., *FiLM*, AAAI 2018), and mix its weights from two sets (Yang
 et al., *CondConv*, NeurIPS 2019). Where the kernel is known, the residual is added back twice (Irani, Peleg, CVGIP
-1991). Maps of the photo's own size are averaged over 2 x 2 pixels for the trunk, and have the weights of factor 2. Two
-more outputs are the expected errors of the logarithm of disparity and of the normal. The layers at the low resolution
-are alike for all factors. Disparity is divided by its median, so that the result does not depend on the unit.
+1991). Maps of the photo's own size have the weights of factor 2. Disparity is divided by its median.
 """
 
 from __future__ import annotations
@@ -177,7 +175,7 @@ class FacetsUNet(DisparityNetwork):
 
         ``rgb`` is (B, 3, H, W) in [0, 1], ``disparity`` (B, 1, h, w), positive, with non-finite holes, ``noise``
         (B, 1, h, w) the standard deviation of its logarithm and ``hints`` (B, ``FACTS``), if they are known; ``filled``
-        the disparity without holes and ``kernels`` those of the hints, if they were computed before.
+        and ``kernels`` are what :meth:`prepare` computes.
         """
         expect_rgb_size(rgb, disparity, 1 if self.scale < 4 and rgb.shape[-1] == disparity.shape[-1] else self.scale)
         known = disparity.isfinite()
@@ -206,8 +204,7 @@ class FacetsUNet(DisparityNetwork):
     ) -> tuple[Tensor, Tensor]:
         """Return high-resolution values, (B, 1, H, W), and the logarithms of both expected errors, (B, 2, H, W).
 
-        ``values`` (B, 1, h, w) are disparity over its median, without holes, ``known`` (B, 1, h, w) false where one was
-        filled in, ``noise`` the standard deviation of their logarithm where that is known.
+        ``values`` (B, 1, h, w) are disparity over its median, ``known`` (B, 1, h, w) false where a hole was filled in.
         """
         scale, given = int(rgb.shape[-1] // values.shape[-1]), values
         dtype = self.photo.weight.dtype

@@ -4,11 +4,10 @@ Hui, Loy, Tang, *Depth Map Super-Resolution by Deep Multi-Scale Guidance*, ECCV 
 that Voynov et al., *Perceptual Deep Depth Super-Resolution*, ICCV 2019, trained for renderings (variant ``voynov``);
 ``dsr`` is the latter as this project trains it.
 
-The network refines the difference of the normalised low-resolution disparity to its 3 x 3 mean, guided by an intensity
-image. The mean itself is upsampled bicubically and added back. ``hui`` is a Caffe network: its transposed convolutions
-have no output padding, so the last row and column are missing, and its PReLUs have a slope for each channel.
-``voynov`` subtracts from the output its mean over a flat probe, the *drift*. ``dsr`` has no drift, its guidance is the
-luma alone, which does not depend on the rest of the image, and holes are inpainted instead of set to the minimum.
+The network refines the difference of the normalised low-resolution disparity to its 3 x 3 mean, which is upsampled
+bicubically and added back, guided by an intensity image. ``hui`` is a Caffe network: the last row and column are
+missing, and its PReLUs have a slope for each channel. ``voynov`` subtracts its mean over a flat probe, the *drift*.
+``dsr`` has no drift, its guidance is the luma alone, and holes are inpainted instead of set to the minimum.
 """
 
 from __future__ import annotations
@@ -150,11 +149,7 @@ class MSGNet(DisparityNetwork):
         return ConvLayer(nn.Conv2d(before, after, kernel, padding=kernel // 2), 1 if self.covers else after)
 
     def forward(self, guidance: Tensor, depth: Tensor) -> Tensor:
-        """Map normalised inputs to the high-resolution residual, (B, 1, H, W), in units of the disparity's range.
-
-        ``guidance`` (B, 1, H, W) is that of :func:`guidance_map`, ``depth`` (B, 1, h, w) normalised disparity minus its
-        mean.
-        """
+        """Map guidance (B, 1, H, W) and normalised disparity less its mean (B, 1, h, w) to the residual."""
         pyramid = [self.guidance[1](self.guidance[0](guidance))]  # (B, 32, H, W), (B, 32, H / 2, W / 2), ...
         for layer in self.guidance[2:]:
             pyramid.append(self.pool(layer(pyramid[-1])))
@@ -172,10 +167,7 @@ class MSGNet(DisparityNetwork):
         detail_range: Tensor | None = None,
         drift: Tensor | None = None,
     ) -> Tensor:
-        """Return high-resolution disparity; see :meth:`~dsr.methods.networks.network.DisparityNetwork.upsample`.
-
-        It is (B, 1, H - 1, W - 1) for the ``hui`` variant, and can be negative.
-        """
+        """Return high-resolution disparity, see the base class; (B, 1, H - 1, W - 1) for the ``hui`` variant."""
         expect_rgb_size(rgb, disparity, self.scale)
         values, minimum, value_range = normalise(disparity, min_max)
         if self.variant == "dsr":
@@ -214,9 +206,9 @@ class MSGNet(DisparityNetwork):
     def drift(self, guidance: Tensor, values: Tensor) -> Tensor:
         """Return the constant offset of the output of a ``voynov`` network, (B, 1, 1, 1).
 
-        The first quarter of rows and columns of the normalised disparity, (B, 1, h, w), is set to 0.5. The output is
-        averaged over rows h // 16 .. h // 4 - h // 16 and the corresponding columns of high-resolution pixels, as in
-        the released code. The network runs only on the inputs that these depend on. Without any, the offset is 0.
+        As in the released code: the first quarter of rows and columns of the normalised disparity, (B, 1, h, w), is set
+        to 0.5, and the output is averaged over rows h // 16 .. h // 4 - h // 16 of high-resolution pixels, and columns.
+        The network runs only on the inputs that these depend on. Without any, the offset is 0.
         """
         height, width = values.shape[-2:]
         rows, columns = (slice(n // 16, n // 4 - n // 16) for n in (height, width))
@@ -230,11 +222,7 @@ class MSGNet(DisparityNetwork):
         return output[..., rows, columns].mean((-2, -1), keepdim=True)
 
     def rows_seen(self, rows: int) -> int:
-        """Return how many low-resolution rows (times scale, guidance rows) the outputs 0 .. ``rows`` - 1 depend on.
-
-        Computed backwards along the depth branch with the ``voynov`` variant's padding: a 5 x 5 convolution needs 2
-        more rows, and output o of a transposed convolution reads inputs up to (o + 2) // 2. Guidance needs no more.
-        """
+        """Return how many low-resolution rows (times scale, guidance rows) the outputs 0 .. ``rows`` - 1 depend on."""
         seen = rows + 4  # reconstruction, smoothing
         for _ in self.levels:
             seen = (seen + 4 + 1) // 2 + 1  # refinement and fusion, then the transposed convolution

@@ -1,9 +1,8 @@
 """The networks, which map low-resolution disparity and an RGB image to high-resolution disparity, and their method.
 
-Large images are computed in tiles of low-resolution pixels, which bounds the memory. A tile is computed from a window
-with half of the overlap with its neighbours and a margin of the receptive-field radius, so that neighbours agree where
-they overlap; they are blended there with linear ramps. Values of the whole image, such as the range of the disparity,
-are computed before.
+Large images are computed in tiles of low-resolution pixels, from windows with half of the overlap with the neighbours
+and a margin of the receptive-field radius, and blended with linear ramps. Values of the whole image, such as the range
+of the disparity, are computed before.
 """
 
 from __future__ import annotations
@@ -98,9 +97,8 @@ class DisparityNetwork(nn.Module, abc.ABC):
         """Return high-resolution disparity, (B, 1, H, W) in the dtype of ``disparity``; NaN without a valid pixel.
 
         ``rgb`` is (B, 3, H, W) in [0, 1], ``disparity`` (B, 1, h, w) in pixels of the high-resolution camera with
-        non-finite holes, ``min_max`` (B, 2, 1, 1) the range of the image that this is a window of, for the
-        normalisation; None for that of ``disparity``. With a receptive-field radius, a network takes all of its
-        :meth:`context` as further arguments.
+        non-finite holes, ``min_max`` (B, 2, 1, 1) the range of the image that this is a window of. With a
+        receptive-field radius, a network takes all of its :meth:`context` as further arguments.
         """
 
     def context(self, rgb: Tensor, disparity: Tensor) -> tuple[Tensor | None, ...]:
@@ -128,9 +126,8 @@ class DisparityNetwork(nn.Module, abc.ABC):
 class NormalisedNetwork(DisparityNetwork):
     """A network whose input is an RGB image and inpainted low-resolution disparity, normalised to 0..1.
 
-    The output is rescaled to the range of the input, so the network commutes with affine maps of the disparity, and a
-    constant map stays constant. The module maps (B, 3, H, W) and (B, 1, h, w) to (B, 1, H, W); for a window it gets
-    what :meth:`context` returns beside the range as further arguments.
+    The output is rescaled to the range of the input. The module maps (B, 3, H, W) and (B, 1, h, w) to (B, 1, H, W); for
+    a window it gets what :meth:`context` returns beside the range as further arguments.
     """
 
     def upsample(
@@ -177,8 +174,6 @@ def expect_rgb_size(rgb: Tensor, values_lr: Tensor, scale: int) -> None:
 
 class NetworkUpsampler(Method):
     """A method that is a trained network.
-
-    The memory is about 40 bytes per pixel of the image, and 700 to 1300 bytes per pixel of a tile's window.
 
     Args:
         net: the network; it is copied.
@@ -301,10 +296,7 @@ def split_image(
 
 
 def split_axis(size: int, tile: int, radius: int, overlap: int) -> list[AxisTile]:
-    """Split an axis of low-resolution pixels into tiles whose sizes differ by one pixel at most.
-
-    ``tile`` is their maximum size without the overlaps, which are even, and ``radius`` that of the receptive field.
-    """
+    """Split low-resolution pixels into tiles of at most ``tile`` without the overlaps, sizes alike to one pixel."""
     count = max(1, min(math.ceil(size / tile), size // max(overlap, 1)))
     edges, half, found = [round(i * size / count) for i in range(count + 1)], overlap // 2, []
     for i in range(count):
@@ -322,11 +314,7 @@ def blend_tiles(
     scale: int,
     progress: Steps | None = None,
 ) -> Tensor:
-    """Compute an image, (B, C, scale * h, scale * w), tile by tile and blend the tiles.
-
-    ``compute`` maps rows and columns of low-resolution pixels to their high-resolution pixels. It may leave out the
-    last high-resolution row and column, which the result then lacks.
-    """
+    """Compute an image, (B, C, scale * h, scale * w), in tiles of low-resolution rows and columns, and blend them."""
     total = torch.empty(0)
     for done, (row, column) in enumerate(itertools.product(rows, columns), 1):
         output = compute(row.read, column.read)

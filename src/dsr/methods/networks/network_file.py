@@ -4,9 +4,8 @@ What a network's authors did to its inputs is no part of its file: which quantit
 how the map was enlarged. The configuration of :class:`NetworkFile` declares it.
 
 A file that dsr writes takes a photo and a map of inverse depth of any size, and holds everything between: filling of
-holes, normalisation, the network, and the way back to the unit of the input. It is one pass of the network, without
-test-time augmentation, tiles, and the resizing for ratios between the factors. PyTorch's tracing exporter makes the
-graph. The other one (``dynamo=True``) needs minutes for Facets, and rules out sizes because of layouts in memory.
+holes, normalisation, one pass of the network, and the way back to the unit of the input. PyTorch's tracing exporter
+makes the graph. The other one (``dynamo=True``) needs minutes for Facets, and rules out sizes.
 """
 
 from __future__ import annotations

@@ -7,9 +7,8 @@ the upsampled map becomes f, and weights w. A fixed number of steps of Chambolle
     E(u) = sum over pairs (i, i + d) of h(u[i + d] - u[i], w[i, d]) + data / 2 * sum (u - f)^2,
 
 with d half of the offsets of a square window and h(x, w) = x^2 / (2 huber) where |x| <= huber w, else
-w |x| - huber / 2 w^2. What differs is in docs/measurements/methods.md; the *bend*, the unit of the residual, is the
-largest second difference of the low-resolution map around a pixel (:mod:`dsr.methods.networks.facets_planes`), which is
-0 on planes.
+w |x| - huber / 2 w^2. What differs is in docs/measurements/methods.md; the unit of the residual is the *bend* of
+:mod:`dsr.methods.networks.facets_planes`.
 """
 
 from __future__ import annotations
@@ -46,8 +45,7 @@ def half_window(window: int) -> list[tuple[int, int]]:
 def pair_differences(x: Tensor, window: int) -> Tensor:
     """Return x[i + d] - x[i] for each pixel i whose pair may touch the image, and each offset d of :func:`half_window`.
 
-    ``x`` is (B, 1, H + 2 r, W + 4 r), the image, r rows above and below, 2 r columns on the left and the right; r is
-    the window's radius. The result is (B, N, H + r, W + 2 r): of the image, r rows below, r columns on either side.
+    With the window's radius r, ``x`` is (B, 1, H + 2 r, W + 4 r), the result (B, N, H + r, W + 2 r).
     """
     r = window // 2
     height, width = x.shape[-2] - r, x.shape[-1] - 2 * r
@@ -127,13 +125,12 @@ def _apply(function: type[torch.autograd.Function], *arguments: Any) -> Tensor:
 class UnrolledHuber(nn.Module):
     """A fixed number of iterations with learned parameters, stored as logarithms so that they are positive.
 
-    The first step sizes are those with which the iteration converges (Chambolle and Pock 2011, algorithm 3); the norm
-    of K is at most 2 sqrt(N), because that of the differences along each of the N offsets is at most 2.
+    The first step sizes are those with which the iteration converges (Chambolle and Pock 2011, algorithm 3).
     """
 
     def __init__(self, window: int = 5, iterations: int = 10, data: float = 10.0, huber: float = 1.0) -> None:
         super().__init__()
-        norm = 2 * math.sqrt(len(half_window(window)))
+        norm = 2 * math.sqrt(len(half_window(window)))  # of the differences, at most: 2 along each offset
         if iterations < 1:
             raise ValueError(f"iterations: expected at least 1, got {iterations}")
         self.window = window
@@ -144,10 +141,7 @@ class UnrolledHuber(nn.Module):
         self.log_steps = nn.Parameter(first.repeat(iterations, 1))  # (iterations, 3): sigma, tau, theta
 
     def forward(self, first: Tensor, weights: Tensor) -> Tensor:
-        """Map f, continued as :func:`pair_differences` takes it, and positive weights, (B, N, H, W), to u - f.
-
-        The iteration works on u - f, (B, 1, H, W). The weights are repeated beyond the border.
-        """
+        """Map f, as :func:`pair_differences` takes it, and positive weights, (B, N, H, W), to u - f, (B, 1, H, W)."""
         r, dtype = self.window // 2, weights.dtype
         slopes = pair_differences(first, self.window).to(dtype)
         data, huber = self.log_data.to(dtype).exp(), self.log_huber.to(dtype).exp()
@@ -165,8 +159,6 @@ class UnrolledHuber(nn.Module):
 
 class PrimalDualNetwork(NormalisedNetwork):
     """The network.
-
-    Memory: about 900 bytes for each pixel of the photo, or of a window.
 
     Args:
         scale: upsampling factor, 2, 4, 8 or 16.

@@ -4,10 +4,9 @@ Ma and Karaman, *Sparse-to-Dense: Depth Prediction from Sparse Depth Samples and
 and an image that holds the samples, and 0 elsewhere, are one input. ResNet-18 (He et al., CVPR 2016) encodes it at 1/32
 of its size; four up-projections (Laina et al., 3DV 2016) double the size, and a bilinear enlargement follows.
 
-What differs: the samples are a low-resolution map, whose pixel (i, j) lies at (scale i + scale // 2, scale j +
-scale // 2), next to the centre of its block; the original draws random pixels of the true depth. It works on disparity,
-normalised by the low-resolution map to 1..2, so that 0 is no value. The trunk has half the channels by default, and
-starts from random weights. The enlargement aligns the images' outer edges, not the centres of their outer pixels.
+What differs: the samples are a low-resolution map, each next to the centre of its block; the original draws random
+pixels of the true depth. It works on disparity, normalised by the low-resolution map to 1..2, so that 0 is no value.
+The trunk has half the channels by default, and starts from random weights.
 """
 
 from __future__ import annotations
@@ -27,10 +26,7 @@ _STAGES = 4
 
 
 class SparseToDense(NormalisedNetwork):
-    """The network.
-
-    An image is processed as a whole, because the receptive field is wider than most images, in about 150 bytes for each
-    pixel of the photo.
+    """The network, which processes an image as a whole: the receptive field is wider than most images.
 
     Args:
         scale: upsampling factor, 2, 4, 8 or 16.

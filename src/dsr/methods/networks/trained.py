@@ -68,11 +68,7 @@ class TrainedNetwork(NetworkUpsampler):
 
 
 def load_msg_weights(path: Path, scale: int, variant: VariantName | None = None) -> MSGNet:
-    """Load the network of one of the authors' files, in float32 on the CPU.
-
-    The file is ``.pth`` of Voynov et al. or ``.caffemodel`` of Hui et al., recognised by its content, and has to be of
-    the scale and, unless that is None, of the variant.
-    """
+    """Load the network of one of the authors' files, recognised by its content, in float32 on the CPU."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such weights file")
     data = read_limited(path, MOST_FILE)

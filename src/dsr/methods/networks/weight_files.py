@@ -94,10 +94,7 @@ def has_weights(node: Any, scale: float) -> bool:
 
 
 def nearest_scale(trained: Collection[float], scale: float) -> float:
-    """Return the trained factor whose weights suit a factor: itself, else the smallest whole one above, or the largest.
-
-    Weights for a factor that is not whole were trained on one sensor's maps and suit no others.
-    """
+    """Return the trained factor that suits a factor: itself, else the smallest whole one above, or the largest."""
     if scale in trained:
         return scale
     whole = [each for each in trained if float(each).is_integer()]
@@ -115,9 +112,8 @@ def save_network(
 ) -> None:
     """Write a network's weights, not atomically; equal networks and facts give equal bytes.
 
-    ``model`` is its name in ``conf/model``, ``facts`` are further plain values for readers of the file, ``half`` stores
-    the kernels of convolutions in half precision, and ``links`` are other files of weights in the same folder by keys
-    of ``LINKS``: tensors that the ``shared`` one has, too, are not written again.
+    ``model`` is its name in ``conf/model``, ``half`` stores the kernels of convolutions in half precision, ``links``
+    are other files in the same folder by keys of ``LINKS``: tensors that the ``shared`` one has are not written again.
     """
     header = {
         "format": FORMAT,

@@ -18,9 +18,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.base import Cost
-from dsr.methods.images import normalise_imagenet
-from dsr.methods.networks.dct import dct2, idct2, laplacian_eigenvalues
-from dsr.methods.networks.peers.peer_network import PeerNetwork
+from dsr.methods.images import dct2, idct2, laplacian_eigenvalues, normalise_imagenet
+from dsr.methods.networks.peers import PeerNetwork
 
 FEATURES = 64
 _LAYERS = 4
@@ -79,8 +78,7 @@ class CoupledLayer(nn.Module):
 class DCTNet(PeerNetwork):
     """DCTNet with its authors' sizes: 64 features, 4 layers, 0.48 million parameters.
 
-    The attention and the cosine transform see the whole image, so there are no tiles: large images need about 1.6 kB
-    of memory per pixel.
+    The attention and the cosine transform see the whole image, so there are no tiles.
     """
 
     title = "DCTNet"
@@ -121,10 +119,7 @@ class DCTNet(PeerNetwork):
 
 
 def transfer_edges(depth: Tensor, guide: Tensor, weight: Tensor, strength: Tensor) -> Tensor:
-    """Return x with (1 + strength L^2) x = depth + strength L (weight L guide), L the Laplacian.
-
-    The first three are (B, C, H, W), ``strength`` (1, C, 1, 1), and x in float32 or float64.
-    """
+    """Return x with (1 + strength L^2) x = depth + strength L (weight L guide), (B, C, H, W), L the Laplacian."""
     dtype = torch.promote_types(strength.dtype, torch.float32)
     height, width = depth.shape[-2:]
     eigenvalues = laplacian_eigenvalues(height, width, strength).square()

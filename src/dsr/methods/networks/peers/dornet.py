@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.methods.base import Cost
-from dsr.methods.networks.peers.peer_network import (
+from dsr.methods.networks.peers import (
     ChannelAttention,
     PeerNetwork,
     ResidualGroup,

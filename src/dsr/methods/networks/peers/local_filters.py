@@ -21,7 +21,7 @@ from torch.nn import functional
 from dsr.degradation.downsampling import cubic_kernel
 from dsr.methods.base import Cost
 from dsr.methods.images import grey
-from dsr.methods.networks.peers.peer_network import SWAPPED_LUMA, PeerNetwork, fold_batch_norm
+from dsr.methods.networks.peers import SWAPPED_LUMA, PeerNetwork, fold_batch_norm
 
 _WIDTH, _DEPTH, _SLOPE = 64, 10, 0.1
 _CUBIC = -0.75  # parameter of the cubic kernel
@@ -49,8 +49,7 @@ class SVLRM(PeerNetwork):
     def enlarge(self, values_lr: Tensor, size: tuple[int, int]) -> Tensor:
         """Enlarge a map by cubic interpolation, shifted to the left and upwards by (scale - 1) / 2 pixels.
 
-        The authors' training takes the last pixel of each block as the low-resolution value and enlarges the map as if
-        it were the middle one, so the network has learnt to undo such a shift.
+        The authors' training takes the last pixel of each block for its middle, so the network undoes such a shift.
         """
         shift, (height, width) = (self.scale - 1) / 2, values_lr.shape[-2:]
         down = _cubic_interpolation(height, size[0], shift).to(values_lr)

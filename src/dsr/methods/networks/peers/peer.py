@@ -1,9 +1,8 @@
 """The method that runs a published network of the field.
 
-Such a network maps a photo and an enlarged map in 0..1 to a refined map in 0..1. Its authors trained it on depth or on
-disparity of one data set, normalised; most of them normalise by the minimum and the maximum of the *true* map, which no
-method can know. :class:`Peer` takes those of the low-resolution map, and the true ones only on request, to reproduce
-the authors' figures.
+Such a network maps a photo and an enlarged map in 0..1 to a refined map in 0..1. Most authors normalise by the minimum
+and the maximum of the *true* map, which no method can know. :class:`Peer` takes those of the low-resolution map, and
+the true ones only on request, to reproduce the authors' figures.
 """
 
 from __future__ import annotations
@@ -23,10 +22,10 @@ from dsr.geometry.camera import RANGE_TYPES, RangeType, from_range, to_range
 from dsr.methods.base import Abilities, Method
 from dsr.methods.images import compute_min_max, inpaint, normalise, pad_to_multiple
 from dsr.methods.networks.network import DTYPES, Precision, blend_tiles, split_image
+from dsr.methods.networks.peers import PeerNetwork, load_peer
 from dsr.methods.networks.peers.dctnet import DCTNet
 from dsr.methods.networks.peers.dornet import DORNet
 from dsr.methods.networks.peers.local_filters import FDKN, SVLRM
-from dsr.methods.networks.peers.peer_network import PeerNetwork, load_peer
 from dsr.methods.networks.peers.pgsr import PGSR
 from dsr.methods.networks.weight_files import nearest_scale
 from dsr.sample import DepthSample
@@ -45,8 +44,8 @@ _OVERLAP = 16  # of neighbouring tiles in pixels
 class Peer(Method):
     """A method that is a published network; it takes maps of any ratio, as the network works at the photo's size.
 
-    At a whole factor that the network was trained for, the file must be for that factor. At any other factor, such as a
-    sensor's 8/3, any of its files may be taken.
+    At a whole factor that the network was trained for, the file must be for that factor; at another one, any may be
+    taken.
 
     Args:
         peer: name of the network, a key of ``PEERS``; or a network, which is copied, in place of a file.

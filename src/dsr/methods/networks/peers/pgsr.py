@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from dsr.methods.base import Cost
 from dsr.methods.images import grey, normalise_imagenet
-from dsr.methods.networks.peers.peer_network import SWAPPED_LUMA, PeerNetwork, ResidualGroup, conv3x3, fold_batch_norm
+from dsr.methods.networks.peers import SWAPPED_LUMA, PeerNetwork, ResidualGroup, conv3x3, fold_batch_norm
 
 _FACTOR, _WIDTH, _SHARED, _LAST = 4, 32, 16, 64
 _SQUEEZED = 2
@@ -34,8 +34,7 @@ _UNUSED = re.compile(r"^(PAI_\d\.(upconv\d|fusion2Depth)|conv_(depth|rgb)_mappin
 class PGSR(PeerNetwork):
     """PGSR with its authors' sizes: 32 features, 0.73 million parameters.
 
-    Its attention averages over the whole image, and its offsets are fractions of the image's size, so large images are
-    not processed in tiles. Only the last layers, which need most of the memory, are computed in strips.
+    Its attention averages over the whole image, so there are no tiles. Only the last layers are computed in strips.
     """
 
     title = "PGSR"
