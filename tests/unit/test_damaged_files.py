@@ -38,9 +38,9 @@ from dsr.data.matlab import read_variables
 from dsr.evaluation.results import load_errors, load_prediction, prediction_path, sample_path
 from dsr.evaluation.run_files import load_results, read_run
 from dsr.geometry.camera import Camera
-from dsr.io.captures.arkit import ARKITSCENES, POLYCAM
-from dsr.io.captures.record3d import RECORD3D
-from dsr.io.captures.stray import STRAY
+from dsr.io.captures.arkit import find_arkitscenes, find_polycam
+from dsr.io.captures.record3d import read_archive
+from dsr.io.captures.stray import find as find_stray
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import read_input, write_input
 from dsr.io.inputs import read_picture
@@ -246,10 +246,10 @@ def transform(folder, _, value):
 
 def camera_of_polycam(folder, key, value):
     captures.polycam(folder)
-    pair = POLYCAM.frames(folder).pairs[0]
+    pair = find_polycam(folder).pairs[0]
     path = pair.capture.description
     path.write_text(replaced(json.dumps(json.loads(path.read_text())), key, value))
-    return path, lambda: read_picture(POLYCAM.frames(folder).pairs[0], Reading())
+    return path, lambda: read_picture(find_polycam(folder).pairs[0], Reading())
 
 
 def result(folder, key, value):
@@ -284,7 +284,7 @@ def test_value_that_is_no_number_is_refused_by_file_and_key(tmp_path, write, key
 @pytest.mark.parametrize(("key", "value"), [("w", True), ("K", [True] * 9), ("poses", [["60"] * 7])])
 def test_metadata_of_record3d_with_a_value_that_is_no_number_are_refused(tmp_path, key, value):
     captures.record3d(tmp_path / "scan.r3d", **{key: value})
-    assert key in refusal(tmp_path / "scan.r3d", RECORD3D.frames, tmp_path)
+    assert key in refusal(tmp_path / "scan.r3d", read_archive, tmp_path)
 
 
 @pytest.mark.parametrize("entry", [
@@ -650,14 +650,14 @@ def test_trajectory_at_a_time_that_is_no_number_is_refused(tmp_path):
     captures.arkitscenes(tmp_path)
     path = tmp_path / "lowres_wide.traj"
     path.write_text(re.sub(r"^\S+", "nan", path.read_text()))
-    assert ": line 1: expected" in refusal(path, ARKITSCENES.frames, tmp_path)
+    assert ": line 1: expected" in refusal(path, find_arkitscenes, tmp_path)
 
 
 def test_odometry_with_a_field_longer_than_a_table_may_have_is_refused(tmp_path):
     captures.stray(tmp_path)
     path = tmp_path / "odometry.csv"
     path.write_text(path.read_text() + "x" * 200_000 + "\n")
-    assert ": expected a table" in refusal(path, STRAY.frames, tmp_path)
+    assert ": expected a table" in refusal(path, find_stray, tmp_path)
 
 
 @pytest.mark.filterwarnings("error")

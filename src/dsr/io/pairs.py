@@ -1,4 +1,4 @@
-"""Pairs of photo and depth map: from lists of files, and from two folders by the names in them."""
+"""Pairs of photo and depth map: from lists of files, two folders by names, and recordings by time."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 from dsr.io.depth_files import READ_SUFFIXES
-from dsr.io.frames import CONFIDENCE_SUFFIXES, CaptureFrame, ConfidenceMap, find_highest
+from dsr.io.frames import CONFIDENCE_SUFFIXES, CaptureFrame, ConfidenceMap, Source, find_highest
 from dsr.io.photos import HEIC_SUFFIXES
 from dsr.notes import Assumption
-from dsr.utils.guards import natural_key
+from dsr.utils.guards import naming, natural_key
 
 Role = Literal["rgb", "depth", "other"]
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm", *HEIC_SUFFIXES)
@@ -329,12 +329,6 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...], before: str = "") ->
     return dict(sorted((int(match[1]), path) for match, path in found if match))
 
 
-def has_name(folder: Path, first: str, last: str) -> bool:
-    """Return whether a file or folder in a folder has a name that begins and ends so."""
-    with os.scandir(folder) as entries:  # a folder may have a million
-        return any(entry.name.startswith(first) and entry.name.endswith(last) for entry in entries)
-
-
 def make_names_unique(pairs: Iterable[Pair]) -> tuple[Pair, ...]:
     """Return the pairs under names of their own: that of the folder in front where two are the same, else a number."""
     pairs = list(pairs)
@@ -350,3 +344,37 @@ def make_names_unique(pairs: Iterable[Pair]) -> tuple[Pair, ...]:
             number, own = number + 1, f"{name}_{number}"
         unique[own.casefold()] = pair if pair.name == own else replace(pair, name=own)
     return tuple(unique.values())
+
+
+class Shot(NamedTuple):
+    """A photo or a depth map of a recording: the place that messages name, where it is, and when it was taken."""
+
+    place: Path
+    source: Source
+    seconds: float
+
+
+def pair_by_time(photos: Sequence[Shot], depths: Sequence[Shot], frame: CaptureFrame, unit: float) -> PairingResult:
+    """Return the frames of a recording, named by the numbers of their photos; ``frame`` is what all have in common."""
+    with naming(frame.description):
+        partner = match_times(*([shot.seconds for shot in each] for each in (photos, depths)))
+    if not partner:
+        raise ValueError(f"{frame.description}: expected photos and depth maps within 20 ms of each other, found none")
+    pairs = []
+    for first, second in partner:
+        photo, depth = photos[first], depths[second]
+        own = replace(frame, photo=photo.source, depth=depth.source)
+        pairs.append(Pair(f"{first:06}", photo.place, depth.place, unit=unit, capture=own, time=photo.seconds))
+    used = [{place for place, _ in partner}, {place for _, place in partner}]
+    lone = [shot.place for shots, known in zip((photos, depths), used, strict=True)
+            for place, shot in enumerate(shots) if place not in known]  # fmt: skip
+    return PairingResult(tuple(pairs), (), tuple(lone))
+
+
+def join(parts: Mapping[str, PairingResult]) -> PairingResult:
+    """Return the frames of several recordings, whose names begin with that of the recording, and each note once."""
+    pairs: list[Pair] = []
+    for stem, part in parts.items():
+        pairs += (replace(pair, name=stem if pair.name == stem else f"{stem}/{pair.name}") for pair in part.pairs)
+    notes = dict.fromkeys(note for part in parts.values() for note in part.assumptions)
+    return PairingResult(tuple(pairs), tuple(notes), tuple(path for part in parts.values() for path in part.unpaired))

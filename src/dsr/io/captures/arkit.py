@@ -41,10 +41,10 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, Field
 
-from dsr.io.captures.contract import LIDAR, Capture
+from dsr.io.captures.contract import has_name
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Size, stated
 from dsr.io.images import Pixels, read_numbers
-from dsr.io.pairs import Pair, PairingResult, has_name, numbered_files, paired
+from dsr.io.pairs import Pair, PairingResult, numbered_files, paired
 from dsr.io.trajectories import (
     USUAL_SIZE,
     check_pose,
@@ -63,7 +63,7 @@ _SHIFTS = (0.0, -1e-3, 1e-3)
 _Motion = tuple[float, ...]
 
 
-def _find_arkitscenes(folder: Path) -> PairingResult | None:
+def find_arkitscenes(folder: Path) -> PairingResult | None:
     """Return the frames of a video of ARKitScenes."""
     depths = {path.stem: path for path in (folder / "lowres_depth").glob("*.png")}
     kinds = ("wide", "color", "lowres_wide")
@@ -165,7 +165,7 @@ class _PolycamCamera(BaseModel, strict=True):
     t_23: float
 
 
-def _find_polycam(folder: Path) -> PairingResult | None:
+def find_polycam(folder: Path) -> PairingResult | None:
     """Return the frames of a raw export, or of its folder ``keyframes``."""
     frames = folder / "keyframes" if (folder / "keyframes").is_dir() else folder
     kinds = [
@@ -210,7 +210,7 @@ class _ScannerFrame(BaseModel, strict=True):
     pose: Annotated[list[float], Field(min_length=16, max_length=16)] = Field(alias="cameraPoseARFrame")
 
 
-def _find_scanner_app(folder: Path) -> PairingResult | None:
+def find_scanner_app(folder: Path) -> PairingResult | None:
     """Return the frames of an export of all data of 3D Scanner App."""
     if not has_name(folder, "frame_", ".json"):
         return None
@@ -246,52 +246,3 @@ def _scanner_geometry(path: Path | None, size: Size) -> Geometry:
     camera = fitting_camera(str(path), (size, USUAL_SIZE), (fx, fy, cx, cy))
     pose = check_pose(str(path), np.reshape(stored.pose, (4, 4)), opengl=True)
     return Geometry(camera, pose, up="y")
-
-
-ARKITSCENES = Capture(
-    _ARKITSCENES,
-    "`raw` or `3dod` of the data set",
-    "`lowres_depth/` with `wide/`, `color/` or `lowres_wide/`",
-    "depth in mm (16-bit PNG); intrinsics (`*.pincam`); poses by time; confidence 0 to 2",
-    "written by its format",
-    LIDAR,
-    "https://github.com/apple/ARKitScenes/blob/main/DATA.md",
-    _find_arkitscenes,
-    marks=("lowres_depth/*", "lowres_wide.traj"),
-    needs={
-        "lowres_depth/": ("lowres_depth/*.png",),
-        "wide/, color/ or lowres_wide/": ("wide/*.png", "color/*.png", "lowres_wide/*.png"),
-    },
-)
-POLYCAM = Capture(
-    _POLYCAM,
-    "raw data of a scan in developer mode",
-    "`keyframes/` with `cameras/*.json`",
-    "depth in mm (16-bit PNG); corrected photos, else all; intrinsics and pose of each frame; confidence",
-    "written by its format",
-    LIDAR,
-    "https://github.com/PolyCam/polyform#polycams-data-format",
-    _find_polycam,
-    marks=("keyframes/*",),
-    needs={
-        "keyframes/images/": ("keyframes/images/*.jpg", "keyframes/corrected_images/*.jpg"),
-        "keyframes/cameras/*.json": ("keyframes/cameras/*.json", "keyframes/corrected_cameras/*.json"),
-        "keyframes/depth/": ("keyframes/depth/*.png",),
-    },
-)
-SCANNER_APP = Capture(
-    _SCANNER,
-    "share the scan as All data, a folder or ZIP file",
-    "`frame_*.json` with `cameraPoseARFrame`, `frame_*.jpg`, `depth_*.png`",
-    "depth in mm (16-bit PNG; EXR); intrinsics and pose of each frame; confidence 0 to 2",
-    "two real scans, of 24 and 146 photos",
-    LIDAR,
-    "https://github.com/laanlabs/3dScannerApp_samples",
-    _find_scanner_app,
-    marks=("conf_00000.png", "frame_*.json"),
-    needs={
-        "frame_*.jpg": ("frame_*.jpg",),
-        "frame_*.json": ("frame_*.json",),
-        "depth_*.png": ("depth_*.png", "frame_*.exr"),
-    },
-)

@@ -32,7 +32,6 @@ import numpy as np
 
 from dsr.geometry.camera import Lens
 from dsr.geometry.poses import from_quaternion, invert
-from dsr.io.captures.contract import Capture
 from dsr.io.frames import CaptureFrame, Geometry, Record, Size, Source, file_state, stated
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult
 from dsr.io.trajectories import intrinsics_camera
@@ -377,14 +376,3 @@ def _points(path: Path, _state: tuple[int, int]) -> tuple[np.ndarray, np.ndarray
     points = np.frombuffer(stored, [("number", number), ("place", "<f8", 3)])
     order = np.argsort(points["number"], kind="stable")
     return points["number"][order].astype(np.float64), points["place"][order]
-
-
-COLMAP = Capture(
-    _APP,
-    "a sparse model, in the folder of photos and depth maps, or of photos alone; or `--poses MODEL`",
-    "`sparse/0/`, `sparse/`, `colmap/sparse/0/` with `images.bin` or `images.txt`, or these beside the photos",
-    "intrinsics; distortion; poses; depth of the maps by its values, without maps of the model's points",
-    "written by pycolmap; models of two real scenes",
-    "",
-    "https://colmap.github.io/format.html",
-)

@@ -44,8 +44,7 @@ import numpy as np
 from dsr.geometry.camera import Camera
 from dsr.geometry.poses import as_rigid
 from dsr.io.cameras import read_camera
-from dsr.io.captures.contract import KINECT1, Capture
-from dsr.io.captures.scannet import read_sens
+from dsr.io.captures.contract import has_name
 from dsr.io.frames import CaptureFrame, Geometry, Size
 from dsr.io.images import read_numbers
 from dsr.io.pairs import (
@@ -53,7 +52,6 @@ from dsr.io.pairs import (
     Pair,
     PairingResult,
     find_camera_file,
-    has_name,
     has_pictures,
     list_pictures,
     match_pairs,
@@ -76,7 +74,7 @@ _PARAMS = ("cam_params.json", "camera.json")
 _CameraOf = Callable[[Size], tuple[Camera | None, str]]
 
 
-def _find_seven_scenes(folder: Path) -> PairingResult | None:
+def find_seven_scenes(folder: Path) -> PairingResult | None:
     """Return the frames of a sequence of 7-Scenes or 3DMatch."""
     if not has_name(folder, "", ".pose.txt"):
         return None
@@ -96,7 +94,7 @@ def _find_seven_scenes(folder: Path) -> PairingResult | None:
     return PairingResult(tuple(pairs), (Assumption(text),), unpaired)
 
 
-def _find_scannet(folder: Path) -> PairingResult | None:
+def find_scannet(folder: Path) -> PairingResult | None:
     """Return the frames of a folder of ScanNet's exports."""
     matrices = [folder / "intrinsic" / f"intrinsic_{kind}.txt" for kind in ("color", "depth")]
     matrices = [path for path in matrices if path.is_file()]
@@ -115,7 +113,7 @@ def _find_scannet(folder: Path) -> PairingResult | None:
     return PairingResult(tuple(pairs), (note,), unpaired)
 
 
-def _find_sunrgbd(folder: Path) -> PairingResult | None:
+def find_sunrgbd(folder: Path) -> PairingResult | None:
     """Return the pair of a scene of SUN RGB-D."""
     matrix, kinds = folder / "intrinsics.txt", [folder / kind for kind in ("depth", "depth_bfx")]
     kinds = [path for path in kinds if path.is_dir() and has_pictures(path)]
@@ -128,7 +126,7 @@ def _find_sunrgbd(folder: Path) -> PairingResult | None:
     return PairingResult(pairs, (Assumption(text),), found.unpaired) if pairs else None
 
 
-def _find_replica(folder: Path) -> PairingResult | None:
+def find_replica(folder: Path) -> PairingResult | None:
     """Return the frames of a scene of Replica as NICE-SLAM renders it."""
     photos = numbered_files(folder / "results", PHOTO_SUFFIXES, "frame")
     depths = numbered_files(folder / "results", (".png",), "depth")
@@ -207,62 +205,3 @@ def _replica(found: Geometry, size: Size) -> Geometry:
         return found
     text = "camera: 600 pixels assumed, that of NICE-SLAM's renderings; there is no cam_params.json"
     return found._replace(camera=_NICE_SLAM, assumptions=(Assumption(text), *found.assumptions))
-
-
-SEVEN_SCENES = Capture(
-    "7-Scenes or 3DMatch",
-    "a sequence",
-    "`*.color.png` or `.jpg`, `*.depth.png`, `*.pose.txt`",
-    "depth in mm (16-bit PNG), 65535 in holes; `camera-intrinsics.txt`, else those of its page; poses",
-    "a real sequence of 1000 frames",
-    KINECT1,
-    "https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/",
-    _find_seven_scenes,
-    marks=("*.pose.txt",),
-    needs={"*.color.png": ("*.color.png", "*.color.jpg"), "*.depth.png": ("*.depth.png",)},
-)
-SCANNET = Capture(
-    "ScanNet",
-    "the `.sens` recording, or its export with SensReader",
-    "`*.sens`; `intrinsic/intrinsic_color.txt` with `color/` and `depth/`",
-    "depth in mm (zlib, raw, 16-bit PNG); intrinsics; poses, none where tracking was lost",
-    "written by its format",
-    KINECT1,
-    "https://github.com/ScanNet/ScanNet/blob/master/SensReader/python/SensorData.py",
-    _find_scannet,
-    read_sens,
-    (".sens",),
-    marks=("intrinsic/intrinsic_*.txt", "pose/*.txt"),
-    needs={
-        "color/": ("color/*",),
-        "depth/": ("depth/*.png",),
-        "intrinsic/intrinsic_color.txt": ("intrinsic/intrinsic_*.txt",),
-    },
-)
-SUNRGBD = Capture(
-    "SUN RGB-D",
-    "a scene in its own folders",
-    "`image/`, `depth/`, `intrinsics.txt`, and `depth_bfx/` or `extrinsics/`",
-    "depth in mm with turned bits; intrinsics",
-    "real frames of two sensors",
-    "Kinects, Xtion and RealSense",
-    "https://rgbd.cs.princeton.edu/",
-    _find_sunrgbd,
-    marks=("depth_bfx/*",),
-    needs={"image/": ("image/*",), "intrinsics.txt": ("intrinsics.txt",)},
-)
-REPLICA = Capture(
-    "Replica of NICE-SLAM",
-    "a rendered scene, or another program's in the same layout",
-    "`results/frame*.jpg`, `results/depth*.png`, and `traj.txt` or `cam_params.json`",
-    "depth in 1/`scale` m (1/6553.5); intrinsics (`cam_params.json`, here or one folder up); poses",
-    "written by its format",
-    "",
-    "https://github.com/cvg/nice-slam/blob/master/src/utils/datasets.py",
-    _find_replica,
-    marks=("results/depth*.png",),
-    needs={
-        "results/frame*.jpg": ("results/frame*",),
-        "traj.txt or cam_params.json": ("traj.txt", "cam_params.json"),
-    },
-)

@@ -23,10 +23,9 @@ from typing import Any, Literal
 import numpy as np
 
 from dsr.geometry.camera import Camera
-from dsr.io.captures.contract import Capture
 from dsr.io.frames import CaptureFrame, Geometry, Record, Size, Source
 from dsr.io.pairs import Pair, PairingResult
-from dsr.io.photos import HEIC_SUFFIXES, decode_heic, open_heic, read_heic, same_aspect, turned_in_heic
+from dsr.io.photos import decode_heic, open_heic, read_heic, same_aspect, turned_in_heic
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import MOST_FILE, MOST_TEXT, numbers_in, opened, read_limited
@@ -59,9 +58,9 @@ class _HeicImage(Source):
         return {"file": f"{self.file.name}/{self.role}", "sha256": file_hash(self.file)}
 
 
-def _read(path: Path) -> PairingResult:
+def read(path: Path) -> PairingResult:
     """Return the pair of a HEIC file."""
-    if not _has_depth(path):
+    if not has_depth(path):
         raise ValueError(f"{path}: expected a HEIC photo with a depth map, as of portrait mode; there is none")
     sources, xmp = (_HeicImage(path, "photo"), _HeicImage(path, "depth")), _depth_xmp(path)
     frame = CaptureFrame(_APP, functools.partial(_geometry, path, xmp), path, xmp, *sources)
@@ -69,7 +68,7 @@ def _read(path: Path) -> PairingResult:
     return PairingResult((pair,), (Assumption("HEIC photos with depth maps of their own"),))
 
 
-def _has_depth(path: Path) -> bool:
+def has_depth(path: Path) -> bool:
     """Return whether a file lists a depth map."""
     with opened(path) as file:
         return _MARK.search(file.read(_HEAD)) is not None
@@ -136,17 +135,3 @@ def _camera(path: Path, text: str, orientation: int, size: Size) -> Camera | Non
             f"{turned[0]} for {size[1]} x {size[0]} pixels (width x height)"
         )
     return intrinsics_camera(f"{path}: depthData:IntrinsicMatrix", turned, (fx, fy, cx, cy))
-
-
-HEIC = Capture(
-    "HEIC photos with depth",
-    "the unmodified `.heic`, as of iPhones in portrait mode; no JPEG of it",
-    "`*.heic`, `*.heif` with a depth map",
-    "depth in m or disparity in 1/m (8 bits), and whether it is relative; intrinsics (XMP, else EXIF); orientation",
-    "a real iPhone photo",
-    "256 steps; of two lenses or a network: guesses on blank walls, hair and glass, mostly no true distances",
-    "https://developer.apple.com/documentation/avfoundation/avdepthdata",
-    of_file=_read,
-    suffixes=HEIC_SUFFIXES,
-    is_ours=_has_depth,
-)

@@ -31,9 +31,8 @@ from pydantic import AliasPath, BaseModel, Field
 from dsr.geometry.camera import Camera, Lens
 from dsr.geometry.poses import as_rigid, invert
 from dsr.io.captures.archive import decode_photo
-from dsr.io.captures.contract import Capture, Shot, pair_by_time
 from dsr.io.frames import CaptureFrame, Geometry, Record, Rig, Size, Source, file_state, stated
-from dsr.io.pairs import PairingResult
+from dsr.io.pairs import PairingResult, Shot, pair_by_time
 from dsr.io.trajectories import describe_capture, intrinsics_camera
 from dsr.utils.guards import expect_pixels, numbers_in, opened, refusing
 from dsr.utils.validation import Number, Whole, parse_model
@@ -138,13 +137,13 @@ class _Packet(Source):
         raise ValueError(f"{self.file}: expected a frame at {self.time} in track {self.track}, there is none any more")
 
 
-def _is_ours(path: Path) -> bool:
+def is_ours(path: Path) -> bool:
     """Return whether a file is a recording of a Kinect, not another video."""
     with opened(path) as file:
         return _MARK in file.read(_HEAD)
 
 
-def _read(path: Path) -> PairingResult:
+def read(path: Path) -> PairingResult:
     """Return the frames of a recording."""
     with _LOCK, _demuxing(path):
         container = _open(path, file_state(path, "a recording"))
@@ -262,18 +261,3 @@ def _open(path: Path, _state: tuple[int, int]) -> Any:
     with opened(path) as file:
         file.read(1)  # or the error names the file, such as that of a link to a device
     return av.open(str(path), format="matroska", options={"codec_whitelist": "rawvideo", "analyzeduration": "0"})
-
-
-KINECT = Capture(
-    _APP,
-    "the `.mkv` of `k4arecorder`; of a Femto Bolt or Mega, that of Orbbec's K4A wrapper",
-    "`*.mkv` with its tracks `COLOR` and `DEPTH`",
-    "depth in mm (b16g), warped into the photo's view; photos as MJPEG, NV12, YUY2, BGRA; intrinsics, extrinsics and "
-    "distortion of both cameras (`calibration.json`), undone; time",
-    "written by its format; a real device's calibration gives its SDK's own numbers",
-    "flying pixels, noise on dark surfaces, rounded corners",
-    "https://github.com/microsoft/Azure-Kinect-Sensor-SDK/tree/develop/src/record",
-    of_file=_read,
-    suffixes=(".mkv",),
-    is_ours=_is_ours,
-)

@@ -27,9 +27,8 @@ import numpy as np
 from dsr.geometry.camera import Camera, Lens
 from dsr.geometry.poses import Matrix, as_rigid, from_quaternion, invert
 from dsr.io.captures.bags import deserialize, first_message, images_of, messages_of, naming_recording
-from dsr.io.captures.contract import STEREO, Capture, Shot, pair_by_time
 from dsr.io.frames import CaptureFrame, Geometry, Rig
-from dsr.io.pairs import PairingResult
+from dsr.io.pairs import PairingResult, Shot, pair_by_time
 from dsr.io.trajectories import describe_capture, intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import naming, numbers_in
@@ -215,14 +214,3 @@ def _device(reader: Any) -> str:
         if name:
             return str(name)
     return "RealSense"
-
-
-REALSENSE = Capture(
-    "RealSense SDK",
-    "record in RealSense Viewer, or `enable_record_to_file`, with depth and colour",
-    "`*.bag` (SDK up to 2.57), `*.db3` (since)",
-    "depth in the unit of `Depth_Units`, warped to the photo; both intrinsics, extrinsics and distortions; time",
-    "two recordings that SDK 2.55 and 2.59 wrote",
-    STEREO,
-    "https://github.com/IntelRealSense/librealsense/blob/master/src/media/ros/ros_file_format.h",
-)  # which dsr.io.captures.ros opens

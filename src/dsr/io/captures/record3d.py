@@ -25,7 +25,6 @@ from typing import Annotated
 from pydantic import BaseModel, Field, ValidationError
 
 from dsr.io.captures.archive import PHOTO_LIMIT, Archive, Member, decode_lzfse, decode_photo
-from dsr.io.captures.contract import LIDAR, Capture
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, stated
 from dsr.io.pairs import Pair, PairingResult, numbered_files, paired
 from dsr.io.trajectories import describe_capture, intrinsics_camera, pose_from_quaternion
@@ -55,10 +54,10 @@ class _Metadata(BaseModel, strict=True):
         return any(pose != self.poses[0] for pose in self.poses) or len(self.poses) == 1
 
 
-def _find(folder: Path) -> PairingResult | None:
+def find(folder: Path) -> PairingResult | None:
     """Return the frames of an unpacked archive or of an export."""
     if (folder / "rgbd").is_dir() and (folder / "metadata").is_file():
-        return _read_archive(folder)
+        return read_archive(folder)
     path = folder / "metadata.json"
     if not path.is_file() or not any((folder / "depth").glob("*.exr")):
         return None
@@ -79,7 +78,7 @@ def _find(folder: Path) -> PairingResult | None:
     return PairingResult(tuple(pairs), _found(metadata, pairs), unpaired)
 
 
-def _read_archive(path: Path) -> PairingResult:
+def read_archive(path: Path) -> PairingResult:
     """Return the frames of an archive or of an unpacked one."""
     archive = Archive(path)
     metadata = _parse(path / "metadata", archive.read("metadata", _METADATA_LIMIT))
@@ -154,19 +153,3 @@ def _frame(path: Path, metadata: _Metadata, number: int) -> CaptureFrame:
         return Geometry(camera, pose_from_quaternion(place, pose[:4], pose[4:], opengl=True), notes, up="y")
 
     return CaptureFrame(_APP, stated(geometry), path, repr((size, numbers, pose)).encode())
-
-
-RECORD3D = Capture(
-    _APP,
-    "the `.r3d` archive, or its export EXR + RGB",
-    "`*.r3d`; its unpacked folder (`metadata`, `rgbd/`); `metadata.json` with `rgb/` and `depth/*.exr`",
-    "depth in m (LZFSE, EXR); intrinsics of each frame, else of all; poses; confidence 0 to 2",
-    "a real export of 341 frames",
-    LIDAR,
-    "https://github.com/marek-simonik/record3d/issues/27",
-    _find,
-    _read_archive,
-    (".r3d",),
-    marks=("rgbd/*.depth",),
-    needs={"metadata": ("metadata",)},
-)

@@ -39,10 +39,9 @@ from dsr.io.captures.bags import (
     naming_recording,
     open_recording,
 )
-from dsr.io.captures.contract import Capture, Shot, pair_by_time
 from dsr.io.captures.ros_images import COLOURS, DEPTHS
 from dsr.io.frames import CaptureFrame, Geometry, Rig, stated
-from dsr.io.pairs import PairingResult, is_registered
+from dsr.io.pairs import PairingResult, Shot, is_registered, pair_by_time
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import naming
@@ -57,13 +56,13 @@ _EXTRINSICS = re.compile(r"(.*/)extrinsics/(\w+)_to_(\w+)")
 _LENSES = {"plumb_bob": "brown_conrady", "rational_polynomial": "brown_conrady", "equidistant": "kannala_brandt"}
 
 
-def _find(folder: Path) -> PairingResult | None:
+def find(folder: Path) -> PairingResult | None:
     """Return the frames of a recording of ROS 2 that is a folder."""
     there = (folder / "metadata.yaml").is_file() and any(any(folder.glob(f"*{each}")) for each in _BESIDE_METADATA)
-    return _read(folder) if there else None
+    return read(folder) if there else None
 
 
-def _read(path: Path) -> PairingResult:
+def read(path: Path) -> PairingResult:
     """Return the frames of a recording."""
     with naming_recording(path):
         reader = open_recording(path)
@@ -297,17 +296,3 @@ def _camera(path: Path, topic: _Topic) -> Geometry:
         return Geometry(camera)
     text = f"the {what}'s lens distortion is not undone: its model {info.model!r:.40} is not known"
     return Geometry(camera, None, (Assumption(text),))
-
-
-ROS = Capture(
-    "ROS 1 and 2",
-    "`rosbag record`, `ros2 bag record` of a colour and a depth topic with their `camera_info`",
-    "`*.bag`, `*.mcap`, `*.db3`; a folder of them, or of `*.zstd`, with `metadata.yaml`",
-    "depth in mm (16UC1), m (32FC1), compressedDepth (PNG, RVL), warped by `/tf_static`; `camera_info`; time",
-    "written by rosbags",
-    "",
-    "https://docs.ros.org/en/api/sensor_msgs/html/index-msg.html",
-    _find,
-    _read,
-    (".bag", ".mcap", ".db3"),
-)

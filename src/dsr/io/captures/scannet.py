@@ -39,7 +39,6 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from dsr.geometry.poses import as_rigid
 from dsr.io.captures.archive import PHOTO_LIMIT, Section, decode_photo, inflate
-from dsr.io.captures.contract import LIDAR, Capture
 from dsr.io.captures.stray import VideoFrame, check_count
 from dsr.io.frames import CaptureFrame, Geometry, Size, stated
 from dsr.io.pairs import Pair, PairingResult, numbered_files
@@ -163,7 +162,7 @@ class _Entry(BaseModel, strict=True):
 _ENTRIES = TypeAdapter(dict[str, _Entry])
 
 
-def _find_scannetpp(folder: Path) -> PairingResult | None:
+def find_scannetpp(folder: Path) -> PairingResult | None:
     """Return the frames of the iPhone in a scene of ScanNet++, or of its folder ``iphone``."""
     folder = folder / "iphone" if (folder / "iphone" / _JSON).is_file() else folder
     path, packed = folder / _JSON, folder / "depth.bin"
@@ -236,21 +235,3 @@ def _iphone_geometry(place: str, entry: _Entry, size: Size) -> Geometry:
         (fx, _, cx), (_, fy, cy), _ = entry.intrinsic
         camera = fitting_camera(place, (size, USUAL_SIZE), (fx, fy, cx, cy))
     return Geometry(camera, as_rigid(entry.aligned_pose, place) if entry.aligned_pose else None, tuple(notes))
-
-
-SCANNETPP = Capture(
-    "ScanNet++ iPhone",
-    "`iphone/` of a scene",
-    "`pose_intrinsic_imu.json` with `rgb.mkv` or `rgb/`, and `depth.bin` or `depth/`",
-    "depth in mm (LZ4) or m (deflate), 256 x 192; intrinsics and pose of each frame",
-    "written by its format",
-    LIDAR,
-    "https://github.com/scannetpp/scannetpp/blob/main/iphone/prepare_iphone_data.py",
-    _find_scannetpp,
-    marks=("pose_intrinsic_imu.json", "depth.bin"),
-    needs={
-        "pose_intrinsic_imu.json": ("pose_intrinsic_imu.json",),
-        "depth.bin": ("depth.bin", "depth/*.png"),
-        "rgb.mkv": ("rgb.mkv", "rgb.mp4", "rgb/*.jpg"),
-    },
-)

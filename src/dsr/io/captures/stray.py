@@ -29,7 +29,6 @@ import cv2
 import numpy as np
 
 from dsr.geometry.camera import Camera
-from dsr.io.captures.contract import LIDAR, Capture
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Record, Size, Source, file_state
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult, numbered_files
 from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera, pose_from_quaternion
@@ -50,7 +49,7 @@ _LARGEST = 1 << 25  # pixels of a frame, those of 8K; a decoder keeps many frame
 _LOCK = threading.Lock()
 
 
-def _find(folder: Path) -> PairingResult | None:
+def find(folder: Path) -> PairingResult | None:
     """Return the frames of a folder of Stray Scanner."""
     video, matrix, odometry = folder / "rgb.mp4", folder / "camera_matrix.csv", folder / "odometry.csv"
     photos, depths = numbered_files(folder / "rgb", PHOTO_SUFFIXES), numbered_files(folder / "depth", (".png", ".npy"))
@@ -228,17 +227,3 @@ def _environment(name: str, value: str) -> Iterator[None]:
             del os.environ[name]
         else:
             os.environ[name] = before
-
-
-STRAY = Capture(
-    _APP,
-    "share the scan's folder",
-    "`camera_matrix.csv` or `odometry.csv`, with `depth/` and `rgb.mp4` or `rgb/000000.png`",
-    "depth in mm (16-bit PNG, NPY); intrinsics and pose of each frame; confidence 0 to 2",
-    "tables of a real scan; pictures written by its format",
-    LIDAR,
-    "https://github.com/strayrobots/scanner/blob/main/docs/format.md",
-    _find,
-    marks=("odometry.csv", "camera_matrix.csv"),
-    needs={"depth/": ("depth/*",), "rgb.mp4 or rgb/": ("rgb.mp4", "rgb/*")},
-)

@@ -22,7 +22,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dsr.io.captures.contract import STEREO, Capture
 from dsr.io.frames import CaptureFrame, Geometry, Size
 from dsr.io.pairs import Pair, PairingResult, numbered_files, paired
 from dsr.io.trajectories import describe_capture, intrinsics_camera
@@ -37,7 +36,7 @@ _RESOLUTIONS = {
 _CAMERA = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 
 
-def _find(folder: Path) -> PairingResult | None:
+def find(folder: Path) -> PairingResult | None:
     """Return the frames of a folder of exported pictures with a calibration."""
     calibrations = sorted(path for path in folder.glob("SN*.conf") if path.is_file())
     photos, depths = (numbered_files(folder, (".png",), kind) for kind in ("left", "depth"))
@@ -86,17 +85,3 @@ def _geometry(path: Path, text: str, size: Size) -> Geometry:
         )[2]  # fmt: skip
     camera = intrinsics_camera(str(path), size, [float(rectified[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2))])
     return Geometry(camera, None, (Assumption("camera: that of the factory calibration, which the SDK refines"),))
-
-
-ZED = Capture(
-    _APP,
-    "LEFT + DEPTH_16Bit of the SDK's sample SVO Export, and `SN*.conf` of the settings folder put beside it",
-    "`left000000.png`, `depth000000.png` and `SN*.conf`",
-    "depth in mm (16-bit PNG); intrinsics of the rectified photo (2208, 1920, 1280, 960 or 672 pixels wide)",
-    "written by its format; calibrations as other programs' tests have them",
-    STEREO,
-    "https://github.com/stereolabs/zed-open-capture",
-    _find,
-    marks=("SN*.conf", "left000000.png"),
-    needs={"left*.png": ("left*.png",), "depth*.png": ("depth*.png",), "SN*.conf": ("SN*.conf",)},
-)
