@@ -26,8 +26,8 @@ from captures import FRAMES, INTRINSICS, SIZE, SIZE_LR
 from dsr.cli import main
 from dsr.geometry.camera import Camera
 from dsr.io.captures import registry
-from dsr.io.captures.archive import decode_lzfse
 from dsr.io.captures.contract import Capture
+from dsr.io.captures.record3d import decode_lzfse
 from dsr.io.inputs import FolderUnits, read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.pairs import Pair, PairingResult

@@ -10,7 +10,7 @@ import pytest
 from captures import FRAMES, INTRINSICS, SIZE
 
 from dsr.geometry.camera import Camera
-from dsr.io.captures.ros_images import decode_message
+from dsr.io.captures.bags import decode_message
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.reading import CameraChoice, Reading

@@ -25,7 +25,7 @@ from dsr.io.captures.colmap import add_model, find_colmap, model_file
 from dsr.io.captures.nerfstudio import add_transforms
 from dsr.io.captures.registry import CAPTURE_FILES, find_capture, lacking
 from dsr.io.depth_files import DEPTH_SUFFIXES
-from dsr.io.frames import CaptureFrame, Geometry
+from dsr.io.frames import CaptureFrame, Geometry, file_state
 from dsr.io.images import read_pixels
 from dsr.io.open3d import add_trajectory
 from dsr.io.pairs import (
@@ -74,7 +74,7 @@ def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResu
     """
     given = folder
     if folder.suffix.lower() == ".zip" and folder.is_file():
-        folder = unpack(folder)
+        folder = unpack(folder, file_state(folder, "an archive"))
         while len(inside := list(folder.iterdir())) == 1 and inside[0].is_dir():
             folder = inside[0]
     if folder.is_file():

@@ -31,7 +31,9 @@ from dsr.geometry.camera import Lens
 from dsr.geometry.poses import Matrix, as_rigid, from_quaternion, invert
 from dsr.io.captures import realsense
 from dsr.io.captures.bags import (
+    COLOURS,
     COMPRESSED,
+    DEPTHS,
     IMAGE,
     connections_of,
     first_message,
@@ -39,7 +41,6 @@ from dsr.io.captures.bags import (
     naming_recording,
     open_recording,
 )
-from dsr.io.captures.ros_images import COLOURS, DEPTHS
 from dsr.io.frames import CaptureFrame, Geometry, Rig, stated
 from dsr.io.pairs import PairingResult, Shot, is_registered, pair_by_time
 from dsr.io.trajectories import intrinsics_camera
