@@ -1,40 +1,21 @@
 """Captures of ARKit's lidar: videos of ARKitScenes, and exports of Polycam and 3D Scanner App.
 
-ARKitScenes; https://github.com/apple/ARKitScenes, DATA.md and raw/README.md.
+ARKitScenes; https://github.com/apple/ARKitScenes, DATA.md and raw/README.md. ``*.pincam`` has width, height, fx, fy,
+cx, cy, of a time that may be a millisecond off; ``lowres_wide.traj`` ten times a second a time, rotation (axis times
+angle) and translation from the world to the camera, whose axes are x right, y down, z forward
+(threedod/benchmark_scripts/utils/tenFpsDataLoader.py inverts them). The world is that of a laser scan, z up
+(https://github.com/apple/ARKitScenes/issues/81).
 
-    41069021/lowres_wide/41069021_305.244.png                photo; ``wide`` (1920 x 1440) is taken where it is there
-    41069021/lowres_depth/41069021_305.244.png               16-bit millimetres, 256 x 192
-    41069021/confidence/41069021_305.244.png                 0 (low) to 2 (high)
-    41069021/lowres_wide_intrinsics/41069021_305.244.pincam  width height fx fy cx cy
-    41069021/lowres_wide.traj                                time, rotation (axis times angle), translation
-
-Rotation and translation of the trajectory lead from the world to the camera, whose axes are x right, y down, z forward
-(threedod/benchmark_scripts/utils/tenFpsDataLoader.py inverts them); the world is that of a laser scan, z up
-(https://github.com/apple/ARKitScenes/issues/81). The trajectory has ten poses a second; a frame
-takes that within 10 ms of it. Intrinsics may be a millisecond off.
-
-Polycam's raw export (developer mode); https://github.com/PolyCam/polyform describes it.
-
-    keyframes/images/TIME.jpg                 photos; the same without distortion in corrected_images/
-    keyframes/cameras/TIME.json               fx fy cx cy width height, t_00 .. t_23; optimised in corrected_cameras/
-    keyframes/depth/TIME.png                  16-bit millimetres, 256 x 192
-    keyframes/confidence/TIME.png             0 (low), 127 (medium) and 255 (high)
-
-t_ij are the rows of the pose from ARKit's camera (y up, looking along -z) to the world, y up. The corrected photos and
-cameras are taken where a frame has both.
-
-3D Scanner App's export of all data; https://github.com/laanlabs/3dScannerApp_samples has some.
-
-    frame_00000.jpg          photos, 1920 x 1440, of every few frames
-    frame_00000.json         intrinsics, 9 numbers row by row, and cameraPoseARFrame, 16, ARKit's camera to world
-    depth_00000.png          16-bit millimetres, 256 x 192; frame_00000.exr in some versions
-    conf_00000.png           0 (low) to 2 (high)
+Polycam's raw export; https://github.com/PolyCam/polyform. t_ij are the rows of the pose from ARKit's camera (y up,
+looking along -z) to the world, y up; the corrected photos and cameras are taken where a frame has both. 3D Scanner
+App's samples, https://github.com/laanlabs/3dScannerApp_samples, have intrinsics and ARKit's pose row by row.
 """
 
 from __future__ import annotations
 
 import functools
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -59,7 +40,6 @@ from dsr.utils.validation import parse_model
 _ARKITSCENES, _POLYCAM, _SCANNER = "ARKitScenes", "Polycam", "3D Scanner App"
 _LARGEST_PINCAM, _LARGEST_JSON = 1 << 16, 1 << 20  # bytes of a file of a camera
 _MAX_GAP = 0.010  # seconds between a frame and its pose
-_SHIFTS = (0.0, -1e-3, 1e-3)
 _Motion = tuple[float, ...]
 
 
@@ -73,17 +53,20 @@ def find_arkitscenes(folder: Path) -> PairingResult | None:
     photos = {path.stem: path for path in sorted((folder / kind).glob("*.png"), key=natural_key)}
     trajectory = folder / "lowres_wide.traj"
     motions = _read_trajectory(trajectory)
+    times = np.array([*motions])
     both, unpaired = paired(photos, depths)
     pairs = []
     for stem in both:
-        intrinsics, motion = find_intrinsics(folder / f"{kind}_intrinsics", stem), _nearest(motions, stem)
+        intrinsics, time = find_intrinsics(folder / f"{kind}_intrinsics", stem), _time(stem)
+        gaps = np.abs(times - time)
+        motion = motions[float(times[gaps.argmin()])] if (gaps <= _MAX_GAP).any() else None
         described = (b"" if intrinsics is None else read_limited(intrinsics, _LARGEST_PINCAM)) + repr(motion).encode()
         geometry = stated(_arkitscenes_geometry, f"{trajectory}: frame {stem}", intrinsics, motion)
-        time = _time(stem) if math.isfinite(_time(stem)) else None
         frame = CaptureFrame(_ARKITSCENES, geometry, intrinsics or trajectory, described)
         path = folder / "confidence" / f"{stem}.png"
         known = ConfidenceMap(path, HIGHEST_LEVEL) if path.is_file() else None
-        pairs.append(Pair(stem, photos[stem], depths[stem], unit=1e-3, capture=frame, confidence=known, time=time))
+        pair = Pair(stem, photos[stem], depths[stem], unit=1e-3, capture=frame, confidence=known)
+        pairs.append(replace(pair, time=time) if math.isfinite(time) else pair)
     text = f"a video of {_ARKITSCENES}, photos of {kind}"
     note = describe_capture(text, "millimetres", pairs, poses=bool(motions))
     return PairingResult(tuple(pairs), (note,), unpaired)
@@ -105,19 +88,10 @@ def _time(stem: str) -> float:
     return next(iter(numbers_in([stem.rpartition("_")[2]])), math.nan)
 
 
-def _nearest(motions: dict[float, _Motion], stem: str) -> _Motion | None:
-    """Return the motion nearest in time to a frame."""
-    times = np.fromiter(motions, np.float64, len(motions))
-    gaps = np.abs(times - _time(stem))
-    if not len(gaps) or not (gaps <= _MAX_GAP).any():
-        return None
-    return motions[float(times[int(gaps.argmin())])]
-
-
 def find_intrinsics(folder: Path, stem: str) -> Path | None:
     """Return the file of a frame's intrinsics, whose time may differ by a millisecond; None where there is none."""
     video = stem.rpartition("_")[0]
-    names = [f"{stem}.pincam", *(f"{video}_{_time(stem) + shift:.3f}.pincam" for shift in _SHIFTS)]
+    names = [f"{stem}.pincam", *(f"{video}_{_time(stem) + shift:.3f}.pincam" for shift in (0.0, -1e-3, 1e-3))]
     return next((folder / name for name in names if (folder / name).is_file()), None)
 
 

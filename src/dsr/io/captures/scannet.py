@@ -33,7 +33,7 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 from dsr.geometry.camera import Camera
 from dsr.geometry.poses import as_rigid
 from dsr.io.captures.archive import PHOTO_LIMIT, Part, decode_photo, inflate, read_section
-from dsr.io.captures.stray import VideoFrame, check_count
+from dsr.io.captures.stray import frames_of_video
 from dsr.io.frames import CaptureFrame, Geometry, Size, stated
 from dsr.io.images import read_numbers
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult, numbered_files, paired
@@ -213,21 +213,19 @@ def find_scannetpp(folder: Path) -> PairingResult | None:
     if not maps:
         parts = _parts(packed)
         maps = {number: packed / part.name for number, part in parts.items()}
-    if video is not None and not photos:
-        photo_of = {number: (video / f"{number:06}", VideoFrame(video, number)) for number in maps}
-    else:
-        photo_of = {number: (photo, None) for number, photo in photos.items()}
-    both, unpaired = paired({number: photo for number, (photo, _) in photo_of.items()}, maps)
+    frames, warnings = {}, []
+    if video is not None and not photos and maps:
+        photos, frames, warnings = frames_of_video(video, maps)
+    both, unpaired = paired(photos, maps)
     pairs = []
     for number in sorted(both):
-        entry, (photo, source) = entries.get(f"frame_{number:06}", _Entry()), photo_of[number]
+        entry = entries.get(f"frame_{number:06}", _Entry())
         geometry, content = partial(_iphone_geometry, f"{path}: frame_{number:06}", entry), entry.model_dump_json()
-        frame = CaptureFrame("ScanNet++ iPhone", geometry, path, content.encode(), source, parts.get(number))
-        pairs.append(Pair(f"{number:06}", photo, maps[number], unit=1e-3, capture=frame))
-    notes = [describe_capture("the iPhone of a scene of ScanNet++", "millimetres", pairs, poses=True)]
-    if video is not None and not photos and maps:
-        notes += check_count(video, max(maps) + 1)
-    return PairingResult(tuple(pairs), tuple(notes), unpaired)
+        sources = frames.get(number), parts.get(number)
+        frame = CaptureFrame("ScanNet++ iPhone", geometry, path, content.encode(), *sources)
+        pairs.append(Pair(f"{number:06}", photos[number], maps[number], unit=1e-3, capture=frame))
+    note = describe_capture("the iPhone of a scene of ScanNet++", "millimetres", pairs, poses=True)
+    return PairingResult(tuple(pairs), (note, *warnings), unpaired)
 
 
 def _parts(path: Path) -> dict[int, Part]:
