@@ -21,8 +21,7 @@ import numpy as np
 
 from dsr.io.cameras import read_any_camera
 from dsr.io.captures.archive import unpack
-from dsr.io.captures.colmap import add_model, find_colmap, model_file
-from dsr.io.captures.nerfstudio import add_transforms
+from dsr.io.captures.colmap import add_model, add_transforms, find_colmap, model_file
 from dsr.io.captures.registry import CAPTURE_FILES, find_capture, lacking
 from dsr.io.depth_files import DEPTH_SUFFIXES
 from dsr.io.frames import CaptureFrame, Geometry, file_state
