@@ -71,22 +71,18 @@ class Rig(NamedTuple):
 class Geometry(NamedTuple):
     """Cameras, lenses and poses of a frame as its capture states them; None where it does not.
 
-    ``camera``: of a size of its own, which is scaled to the photo's. ``pose``: camera to world, (4, 4) float64 in
-    metres, rigid, of the camera's frame x right, y down, z forward; the world's frame is the capture's own.
-    ``lens``: of the photo, and of a depth map without a rig, which lies in the photo's pixels. ``rig``: the depth map's
-    own camera, of a size of its own as well; None if the map is in the photo's view. ``up``: the axis of the world that
-    points up, one of :data:`UPS`. ``damage``: what is wrong with the capture's cameras, which does not matter if others
-    are given. ``apart``: why a depth map that is not in the photo's view is of no use without a given rig.
+    ``pose``: camera to world, (4, 4) float64 in metres, rigid, of the camera's frame x right, y down, z forward; the
+    world's frame is the capture's own.
     """
 
-    camera: Camera | None = None
+    camera: Camera | None = None  # of a size of its own, which is scaled to the photo's
     pose: np.ndarray | None = None
     assumptions: tuple[Assumption, ...] = ()
-    lens: Lens | None = None
-    rig: Rig | None = None
-    up: str = ""
-    damage: str = ""
-    apart: str = ""
+    lens: Lens | None = None  # of the photo, and of a depth map without a rig, which lies in the photo's pixels
+    rig: Rig | None = None  # the depth map's camera, of a size of its own as well; None if it is in the photo's view
+    up: str = ""  # the axis of the world that points up, one of UPS
+    damage: str = ""  # what is wrong with the capture's cameras, which does not matter if others are given
+    apart: str = ""  # why a depth map that is not in the photo's view is of no use without a given rig
 
 
 def stated(read: Callable[_Arguments, Geometry], *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> Geometry:

@@ -32,12 +32,12 @@ from dsr.io.pairs import (
     PairingResult,
     find_camera_file,
     find_pairs_of_two_folders,
-    has_pictures,
     is_registered,
     list_pictures,
     make_names_unique,
     match_pairs,
     match_times,
+    picture_names,
     role_of,
     role_of_words,
     words_of,
@@ -234,7 +234,7 @@ def _role_folders(folder: Path) -> PairingResult:
     named: dict[str, list[Path]] = {"rgb": [], "depth": [], "other": []}
     for path in sorted(folder.iterdir(), key=lambda path: (not is_registered(path.name), len(path.name), path.name)):
         role = role_of_words(words_of(path.name)) if path.is_dir() else None
-        if role is not None and has_pictures(path):
+        if role is not None and any(picture_names(path)):
             named[role].append(path)
     if not named["rgb"] or not named["depth"]:
         return PairingResult(())

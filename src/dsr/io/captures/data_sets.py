@@ -35,11 +35,11 @@ from dsr.io.pairs import (
     Pair,
     PairingResult,
     find_camera_file,
-    has_pictures,
     list_pictures,
     match_pairs,
     numbered_files,
     paired,
+    picture_names,
 )
 from dsr.io.photos import same_aspect
 from dsr.io.reading import SUNRGBD_BITS
@@ -91,7 +91,7 @@ def _seven_scenes(path: Path, camera: Path | None, size: Size) -> Geometry:
 def find_sunrgbd(folder: Path) -> PairingResult | None:
     """Return the pair of a scene of SUN RGB-D."""
     matrix, kinds = folder / "intrinsics.txt", [folder / kind for kind in ("depth", "depth_bfx")]
-    kinds = [path for path in kinds if path.is_dir() and has_pictures(path)]
+    kinds = [path for path in kinds if path.is_dir() and any(picture_names(path))]
     ours = matrix.is_file() and any((folder / name).is_dir() for name in ("depth_bfx", "extrinsics"))
     if not ours or not kinds or not (folder / "image").is_dir():
         return None

@@ -4,15 +4,14 @@ https://github.com/IntelRealSense/librealsense, src/media/ros/ros_file_format.h 
 2.59 writes it. Topics below ``/device_0/sensor_0``, for which the sensor of the stream has its own number:
 
     .bag                                    .db3
-    /file_version                           the same                                    2 to 4
     option/Depth_Units/value (Float32)      the same (String)                           metres; version 2: ``property``
     Depth_0/image/data (Image)              ... or .../data/compressedDepth, /compressed
     Depth_0/info/camera_info (CameraInfo)   Depth_0/camera_info (String: key=value;...)
     Depth_0/tf/1 (Transform)                Depth_0/tf/ref_1 (String), column by column
     Depth_0/image/metadata                  the same, with the frame's time stamp       ms; .bag: in the image's header
 
-``Color_0`` has the same. ``tf`` leads from the frame of reference of its number to the stream's, so depth to colour is
-that of colour after the inverse of that of depth. Frames are paired by their time stamps, within 20 ms.
+``tf`` leads from the frame of reference of its number to the stream's, so depth to colour is that of colour after the
+inverse of that of depth.
 """
 
 from __future__ import annotations

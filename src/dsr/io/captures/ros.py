@@ -1,17 +1,11 @@
 """Recordings of ROS 1 (``.bag``) and ROS 2 (``.mcap``, ``.db3``, or a folder of them with ``metadata.yaml``).
 
-The files in such a folder may be packed (``.zstd``). Messages of sensor_msgs: Image, CompressedImage and CameraInfo,
-http://docs.ros.org/en/api/sensor_msgs/html/index-msg.html; depth is in millimetres as whole numbers and in metres as
-floats, https://ros.org/reps/rep-0118.html.
-
-Depth that is registered to the photos, by the cameras, frame_id or else the topic's name, is taken before other depth,
-photos of a topic named *color*, *colour* or *rgb* before others; then topics with more messages, then the first one.
-Depth of another camera is warped to the photo by /tf_static, /tf or RealSense's ``extrinsics``. A camera is that of the
-topic ``camera_info`` beside the images, for its window and binning and with its distortion; of a topic of
-``image_rect`` its P, without. Photo and depth map are paired by the times in their headers, within 20 ms. Poses are not
-read.
-
-Recordings of RealSense's SDK are those of :mod:`dsr.io.captures.realsense`.
+Messages of sensor_msgs, http://docs.ros.org/en/api/sensor_msgs/html/index-msg.html; depth is in millimetres as whole
+numbers and in metres as floats, https://ros.org/reps/rep-0118.html. Depth that is registered to the photos, by the
+cameras, frame_id or else the topic's name, is taken before other depth, photos of a topic named *color*, *colour* or
+*rgb* before others; then topics with more messages, then the first one. Depth of another camera is warped to the photo
+by /tf_static, /tf or RealSense's ``extrinsics``. A camera is that of the topic ``camera_info`` beside the images, for
+its window and binning and with its distortion; of a topic of ``image_rect`` its P, without. Poses are not read.
 """
 
 from __future__ import annotations
@@ -73,24 +67,13 @@ def read(path: Path) -> PairingResult:
         photo, depth = _choose(path, topics)
         photos, depths = (_shots(reader, path, each.name) for each in (photo, depth))
         in_metres = depths[0].source.read().dtype.kind == "f"
-        same = _have_same_frame(photo, depth)
-        motion = np.eye(4) if same else _transform(reader, photo, depth)
+        motion = np.eye(4) if _have_same_frame(photo, depth) else _transform(reader, photo, depth)
     registered = _are_registered(photo, depth)
     if motion is not None and not is_registered(depth.name):
         registered = registered and np.allclose(motion, np.eye(4), rtol=0, atol=_AT_ONE_PLACE)
-
-    def geometry() -> Geometry:
-        if not registered:
-            return _apart(path, photo, depth, motion)
-        found = _camera(path, photo)
-        if same:
-            return found
-        text = f"depth of the frame {depth.frame!r} counts as registered to photos of {photo.frame!r}"
-        code = "" if is_registered(depth.name) else "other-frame"
-        return found._replace(assumptions=(*found.assumptions, Assumption(text, "", code, 1.0 if code else None)))
-
-    described = repr(photo.info if registered else (photo, depth, motion)).encode()
-    frame = CaptureFrame("ROS", stated(geometry), path, described, apart=not registered)
+    geometry = stated(_registered, path, photo, depth) if registered else stated(_apart, path, photo, depth, motion)
+    content = repr(photo.info if registered else (photo, depth, motion)).encode()
+    frame = CaptureFrame("ROS", geometry, path, content, apart=not registered)
     found = pair_by_time(photos, depths, frame, 1.0 if in_metres else 1e-3)
     unit = "metres" if in_metres else "millimetres"
     notes = [Assumption(f"a recording of ROS: photos of {photo.name}, depth in {unit} of {depth.name}")]
@@ -213,20 +196,15 @@ def _transform(reader: Any, photo: _Topic, depth: _Topic) -> Matrix | None:
 
 
 class _Info(NamedTuple):
-    """What is read of a CameraInfo.
-
-    ``numbers``: fx, fy, cx, cy of (height, width) pixels. ``window``: x, y, width and height of the part of them that
-    the photo shows, 0 for all. ``binning``: how many of them are one pixel of the photo, across and down. ``model``,
-    ``distortion``: of the lens; no numbers without one.
-    """
+    """What is read of a CameraInfo."""
 
     height: int
     width: int
-    numbers: tuple[float, ...]
-    window: tuple[int, int, int, int]
-    binning: tuple[int, int]
-    model: str
-    distortion: tuple[float, ...]
+    numbers: tuple[float, ...]  # fx, fy, cx, cy of (height, width) pixels
+    window: tuple[int, int, int, int]  # x, y, width, height of the part of them that the photo shows, 0 for all
+    binning: tuple[int, int]  # how many of them are one pixel of the photo, across and down
+    model: str  # of the lens
+    distortion: tuple[float, ...]  # empty without one
 
 
 def _camera_info(reader: Any, topic: str, role: str) -> _Info | None:
@@ -240,19 +218,23 @@ def _camera_info(reader: Any, topic: str, role: str) -> _Info | None:
             k, d, p = (info.K, info.D, info.P) if hasattr(info, "K") else (info.k, info.d, info.p)
             rectified = "image_rect" in topic
             matrix = (p[0], p[5], p[2], p[6]) if rectified and p[0] else (k[0], k[4], k[2], k[5])
-            roi = info.roi
-            return _Info(
-                info.height,
-                info.width,
-                tuple(map(float, matrix)),
-                (roi.x_offset, roi.y_offset, roi.width, roi.height),
-                (max(info.binning_x, 1), max(info.binning_y, 1)),
-                info.distortion_model,
-                () if rectified else tuple(map(float, d)),
-            )
+            window = info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height
+            binning = max(info.binning_x, 1), max(info.binning_y, 1)
+            lens = info.distortion_model, () if rectified else tuple(map(float, d))
+            return _Info(info.height, info.width, tuple(map(float, matrix)), window, binning, *lens)
         if role == "depth" or len(place.parts) < 3:
             return None
     return None
+
+
+def _registered(path: Path, photo: _Topic, depth: _Topic) -> Geometry:
+    """Return the camera of a recording whose depth is in the photo's pixels."""
+    found = _camera(path, photo)
+    if _have_same_frame(photo, depth):
+        return found
+    text = f"depth of the frame {depth.frame!r} counts as registered to photos of {photo.frame!r}"
+    code = "" if is_registered(depth.name) else "other-frame"
+    return found._replace(assumptions=(*found.assumptions, Assumption(text, "", code, 1.0 if code else None)))
 
 
 def _apart(path: Path, photo: _Topic, depth: _Topic, motion: Matrix | None) -> Geometry:
