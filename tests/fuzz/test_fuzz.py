@@ -12,8 +12,8 @@ from random import Random
 import numpy as np
 import pytest
 
+from dsr.io.captures import CAPTURES
 from dsr.io.captures.contract import Capture
-from dsr.io.captures.registry import CAPTURES
 from fuzz import judging, readers
 from fuzz.cases import READERS, Cases, numbers_of
 from fuzz.guard import MARK

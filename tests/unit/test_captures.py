@@ -23,9 +23,9 @@ import pytest
 import torch
 from captures import FRAMES, INTRINSICS, SIZE, SIZE_LR
 
+import dsr.io.captures as registry
 from dsr.cli import main
 from dsr.geometry.camera import Camera
-from dsr.io.captures import registry
 from dsr.io.captures.contract import Capture
 from dsr.io.captures.record3d import decode_lzfse
 from dsr.io.inputs import FolderUnits, read_picture
@@ -720,9 +720,13 @@ def test_other_packages_add_captures_by_an_entry_point(folder, monkeypatch, caps
 
 
 def test_documentation_has_the_table_of_captures():
+    table = []
+    for each in registry.CAPTURES:
+        name = f"[{each.name}]({each.source})" if each.source else each.name
+        table.append(f"| {name} | {each.export} | {each.found_by} | {each.read} | {each.tried} | {each.faults} |")
     shown = DOCUMENTATION.read_text(encoding="utf-8").splitlines()
-    first = shown.index(registry.markdown()[0])
-    assert shown[first : first + len(registry.CAPTURES) + 2] == registry.markdown()
+    first = shown.index("| device or program | export | recognised by | read | tried | the sensor |") + 2
+    assert shown[first : first + len(table)] == table
 
 
 def test_command_prints_the_captures_with_a_word(capsys):

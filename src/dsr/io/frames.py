@@ -34,30 +34,41 @@ _Arguments = ParamSpec("_Arguments")
 class Source:
     """A photo or a map inside a file: a frame of a video, a member of an archive, a message of a recording.
 
-    Kinds of sources are frozen dataclasses, which other processes read from the file anew. Those whose pixels depend on
-    bytes of their own have a ``name``, ``content`` and ``decode``.
+    Kinds of sources are frozen dataclasses, which other processes read from the file anew.
+    """
+
+    file: Path
+
+    def read(self) -> np.ndarray:
+        """Return the pixels: (H, W, 3) uint8 RGB of a photo, (h, w) stored values of a map."""
+        raise NotImplementedError
+
+    def record(self) -> Record:
+        """Return what identifies the content."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Part(Source):
+    """Bytes of a file that ``fetch`` returns, and of which ``decode`` makes pixels; its errors need not name the file.
+
+    Both are functions of modules or partial ones, as other processes get them.
     """
 
     file: Path
     name: str
+    fetch: Callable[[], bytes]
+    decode: Callable[[bytes], np.ndarray]
 
     def read(self) -> np.ndarray:
-        """Return the pixels: (H, W, 3) uint8 RGB of a photo, (h, w) stored values of a map."""
-        content = self.content()
+        """Return the pixels."""
+        content = self.fetch()
         with naming(self.file / self.name):
             return self.decode(content)
 
     def record(self) -> Record:
-        """Return what identifies the content."""
-        return {"file": f"{self.file.name}/{self.name}", "sha256": hashlib.sha256(self.content()).hexdigest()}
-
-    def content(self) -> bytes:
-        """Return the bytes in the file."""
-        raise NotImplementedError
-
-    def decode(self, content: bytes) -> np.ndarray:
-        """Return the pixels that the bytes stand for; the message of a ValueError needs no name of the file."""
-        raise NotImplementedError
+        """Return the name and a hash of the bytes."""
+        return {"file": f"{self.file.name}/{self.name}", "sha256": hashlib.sha256(self.fetch()).hexdigest()}
 
 
 class Rig(NamedTuple):

@@ -1,6 +1,6 @@
 """Pairs of photo and depth map in folders of any layout: of recording apps, data sets, or one's own.
 
-The layouts are: a capture (:mod:`dsr.io.captures.registry`), which may be a single file, too; a scene of dsr
+The layouts are: a capture (:mod:`dsr.io.captures`), which may be a single file, too; a scene of dsr
 (``rgb.png``, ``camera.json`` and ``depth*`` or ``disparity*``); lists of TUM RGB-D (``rgb.txt`` and ``depth.txt``,
 https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats); two folders named for photos and depth maps; and files
 side by side, distinguished by their names or contents. To these a model of COLMAP or a trajectory of Open3D may add
@@ -20,9 +20,9 @@ import cv2
 import numpy as np
 
 from dsr.io.cameras import read_any_camera
+from dsr.io.captures import CAPTURE_FILES, find_capture, lacking
 from dsr.io.captures.archive import unpack
 from dsr.io.captures.colmap import add_model, add_transforms, find_colmap, model_file
-from dsr.io.captures.registry import CAPTURE_FILES, find_capture, lacking
 from dsr.io.depth_files import DEPTH_SUFFIXES
 from dsr.io.frames import CaptureFrame, Geometry, file_state
 from dsr.io.images import read_pixels

@@ -10,14 +10,12 @@ import struct
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from dsr.io.frames import Source, file_state
+from dsr.io.frames import file_state
 from dsr.utils.decoding import decode_pixels
 from dsr.utils.files import expect_space, space_for
 from dsr.utils.guards import bytes_of_archive, expect_bytes, files_in, opened, read_limited, read_member, refusing
@@ -25,24 +23,6 @@ from dsr.utils.guards import bytes_of_archive, expect_bytes, files_in, opened, r
 PHOTO_LIMIT = 1 << 26  # bytes of an encoded photo
 # What reading a damaged or encrypted archive raises.
 _DAMAGED = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, RuntimeError, struct.error)
-
-
-@dataclass(frozen=True)
-class Part(Source):
-    """A photo or a map in a file: ``fetch`` returns its bytes, and ``decoder`` their pixels."""
-
-    file: Path
-    name: str
-    fetch: Callable[[], bytes]
-    decoder: Callable[[bytes], np.ndarray]
-
-    def content(self) -> bytes:
-        """Return the bytes."""
-        return self.fetch()
-
-    def decode(self, content: bytes) -> np.ndarray:
-        """Return the pixels."""
-        return self.decoder(content)
 
 
 def members(path: Path) -> list[str]:

@@ -10,15 +10,15 @@ import atexit
 import contextlib
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
 from dsr.io.captures.archive import decode_photo
-from dsr.io.frames import Source
+from dsr.io.frames import Part
 from dsr.utils.decoding import decode_pixels
 from dsr.utils.guards import expect_pixels, path_within, pixels_of_file, refusing
 from dsr.utils.versions import how_to_install
@@ -42,36 +42,36 @@ _LONGEST = 10  # parts of a number in RVL data beyond the first: more than 32 bi
 _CONFIG = struct.Struct("<iff")  # header of compressedDepth: format, and two numbers of the quantisation of floats
 
 
-@dataclass(frozen=True)
-class Message(Source):
-    """An image in a recording."""
+class Message(NamedTuple):
+    """A message of an image: where its pixels are, its bytes, its type, and when it was recorded in nanoseconds."""
 
-    file: Path
-    name: str  # its topic, without the slash that it begins with
-    kind: str  # type of the message
-    time: int  # when it was recorded, in nanoseconds
-    order: int  # number among the topic's messages of this time
-
-    def content(self) -> bytes:
-        """Return the message as it is stored."""
-        with naming_recording(self.file):
-            reader = open_recording(self.file)
-            connections = connections_of(reader, f"/{self.name}")
-            return bytes(list(reader.messages(connections, start=self.time, stop=self.time + 1))[self.order][2])
-
-    def decode(self, content: bytes) -> np.ndarray:
-        """Return (H, W, 3) uint8 RGB of a photo, (h, w) of a depth map as it is stored."""
-        with refusing("expected a message of an image, got a damaged one", Exception):
-            message = deserialize(open_recording(self.file), content, self.kind)
-        return decode_message(message)
+    source: Part
+    raw: bytes
+    kind: str
+    time: int
 
 
-def images_of(reader: Any, path: Path, topic: str) -> Iterator[tuple[Message, bytes]]:
-    """Yield the messages of images of a topic, each with its bytes."""
+def images_of(reader: Any, path: Path, topic: str) -> Iterator[Message]:
+    """Yield the messages of images of a topic."""
     last, order = None, 0
     for connection, time, raw in reader.messages(connections_of(reader, topic)):
         last, order = time, order + 1 if time == last else 0
-        yield Message(path, topic.removeprefix("/"), connection.msgtype, time, order), raw
+        fetch, decode = partial(_fetch, path, topic, time, order), partial(_decode, path, connection.msgtype)
+        yield Message(Part(path, topic.removeprefix("/"), fetch, decode), raw, connection.msgtype, time)
+
+
+def _fetch(path: Path, topic: str, time: int, order: int) -> bytes:
+    """Return the bytes of the message of a topic with a number among those of a time."""
+    with naming_recording(path):
+        reader = open_recording(path)
+        return bytes(list(reader.messages(connections_of(reader, topic), start=time, stop=time + 1))[order][2])
+
+
+def _decode(path: Path, kind: str, content: bytes) -> np.ndarray:
+    """Return (H, W, 3) uint8 RGB of a photo, (h, w) of a depth map as it is stored."""
+    with refusing("expected a message of an image, got a damaged one", Exception):
+        message = deserialize(open_recording(path), content, kind)
+    return decode_message(message)
 
 
 def connections_of(reader: Any, topic: str) -> list[Any]:

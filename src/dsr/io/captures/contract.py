@@ -1,4 +1,4 @@
-"""What a reader of captures provides: one :class:`Capture`, which :mod:`dsr.io.captures.registry` lists."""
+"""What a reader of captures provides: one :class:`Capture`, which :mod:`dsr.io.captures` lists."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ from pydantic import AliasPath, BaseModel, Field
 from dsr.geometry.camera import Camera, Lens
 from dsr.geometry.poses import as_rigid, invert
 from dsr.io.captures.archive import decode_photo
-from dsr.io.frames import CaptureFrame, Geometry, Record, Rig, Size, Source, file_state, stated
+from dsr.io.frames import CaptureFrame, Geometry, Part, Record, Rig, Size, file_state, stated
 from dsr.io.pairs import PairingResult, Shot, pair_by_time
 from dsr.io.trajectories import describe_capture, intrinsics_camera
 from dsr.utils.guards import expect_pixels, numbers_in, opened, refusing
@@ -72,53 +72,47 @@ class _Calibration(BaseModel):
 
 
 @dataclass(frozen=True)
-class _Packet(Source):
-    """A frame of a recording."""
+class _Packet(Part):
+    """A frame of a recording, by its track and when it was taken in the track's unit."""
 
-    file: Path
     track: int
-    time: int  # in the track's unit
-    size: Size
-    kind: str  # b16g of depth, or the first letters of K4A_COLOR_MODE
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        """What messages call it."""
-        return f"{self.kind} frame at {self.time}"
-
-    def decode(self, content: bytes) -> np.ndarray:
-        """Return (H, W, 3) uint8 RGB of a photo, (h, w) uint16 of a depth map as it is stored."""
-        height, width = self.size
-        if self.kind == "MJPG":
-            photo = decode_photo(content)
-            if photo.shape[:2] != self.size:
-                got = f"{photo.shape[1]} x {photo.shape[0]}"
-                raise ValueError(f"expected a photo of {width} x {height} pixels, got {got}")
-            return photo
-        each, code = _COLOURS.get(self.kind, (2, 0))
-        if len(content) != height * width * each:
-            raise ValueError(
-                f"expected {width} x {height} pixels of {each:g} bytes, which are {height * width * each:g}, "
-                f"got {len(content)} bytes"
-            )
-        if self.kind == _DEPTH:
-            return np.frombuffer(content, ">u2").reshape(self.size).astype(np.uint16)
-        rows = (height * 3 // 2, width, 1) if self.kind == "NV12" else (height, width, int(each))
-        return cv2.cvtColor(np.frombuffer(content, np.uint8).reshape(rows), code)
+    time: int
 
     def record(self) -> Record:
         """Return the recording's name, the track's and the time, and a hash of the frame."""
         return {**super().record(), "file": f"{self.file.name}/{self.track}", "frame": self.time}
 
-    def content(self) -> bytes:
-        """Return the frame as it is stored."""
-        with _recording(self.file) as container:
-            track = container.streams[self.track]
-            container.seek(self.time, stream=track, any_frame=True)
-            for packet in container.demux(track):
-                if packet.pts == self.time:
-                    return bytes(packet)
-        raise ValueError(f"{self.file}: expected a frame at {self.time} in track {self.track}, there is none any more")
+
+def _fetch(path: Path, number: int, time: int) -> bytes:
+    """Return the frame of a track as it is stored."""
+    with _recording(path) as container:
+        track = container.streams[number]
+        container.seek(time, stream=track, any_frame=True)
+        for packet in container.demux(track):
+            if packet.pts == time:
+                return bytes(packet)
+    raise ValueError(f"{path}: expected a frame at {time} in track {number}, there is none any more")
+
+
+def _decode(size: Size, kind: str, content: bytes) -> np.ndarray:
+    """Return (H, W, 3) uint8 RGB of a photo, (h, w) uint16 of a depth map as it is stored."""
+    height, width = size
+    if kind == "MJPG":
+        photo = decode_photo(content)
+        if photo.shape[:2] != size:
+            got = f"{photo.shape[1]} x {photo.shape[0]}"
+            raise ValueError(f"expected a photo of {width} x {height} pixels, got {got}")
+        return photo
+    each, code = _COLOURS.get(kind, (2, 0))
+    if len(content) != height * width * each:
+        raise ValueError(
+            f"expected {width} x {height} pixels of {each:g} bytes, which are {height * width * each:g}, "
+            f"got {len(content)} bytes"
+        )
+    if kind == _DEPTH:
+        return np.frombuffer(content, ">u2").reshape(size).astype(np.uint16)
+    rows = (height * 3 // 2, width, 1) if kind == "NV12" else (height, width, int(each))
+    return cv2.cvtColor(np.frombuffer(content, np.uint8).reshape(rows), code)
 
 
 def is_ours(path: Path) -> bool:
@@ -144,7 +138,10 @@ def read(path: Path) -> PairingResult:
         for packet in container.demux([color, depth]):
             if packet.pts is not None:
                 role, track, stored, late = about[packet.stream.index]
-                source = _Packet(path, track.index, packet.pts, (track.height, track.width), stored)
+                fetch = functools.partial(_fetch, path, track.index, packet.pts)
+                decode = functools.partial(_decode, (track.height, track.width), stored)
+                name = f"{stored} frame at {packet.pts}"
+                source = _Packet(path, name, fetch, decode, track.index, packet.pts)
                 seconds = packet.pts * float(packet.time_base) - late
                 shots[role].append(Shot(path / role / f"{len(shots[role]):06}", source, seconds))
         attached = [bytes(each.data) for each in container.streams.attachments if each.name == "calibration.json"]

@@ -194,13 +194,13 @@ def _shots(reader: Any, path: Path, topic: re.Match[str]) -> list[Shot]:
     for time, message in messages_of(reader, f"{topic['stream']}/image/metadata") if reader.is2 else ():
         stamps[time] = numbers_in([_entries(message, "").get("timestamp", "")])
     shots = []
-    for message, raw in images_of(reader, path, topic[0]):
+    for message in images_of(reader, path, topic[0]):
         if reader.is2:
             stamp = 1e-3 * (stamps.get(message.time) or [1e-6 * message.time])[0]
         else:
-            header = deserialize(reader, raw, message.kind).header.stamp
+            header = deserialize(reader, message.raw, message.kind).header.stamp
             stamp = header.sec + 1e-9 * header.nanosec
-        shots.append(Shot(Path(f"{path}{topic[0]}"), message, stamp))
+        shots.append(Shot(Path(f"{path}{topic[0]}"), message.source, stamp))
     return sorted(shots, key=lambda shot: shot.seconds)
 
 

@@ -24,8 +24,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
-from dsr.io.captures.archive import PHOTO_LIMIT, Part, decode_photo, members, read_part
-from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Size, stated
+from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo, members, read_part
+from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Part, Size, stated
 from dsr.io.pairs import Pair, PairingResult, numbered_files, paired
 from dsr.io.trajectories import describe_capture, intrinsics_camera, pose_from_quaternion
 from dsr.notes import Assumption

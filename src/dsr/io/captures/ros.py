@@ -141,10 +141,10 @@ def _choose(path: Path, topics: Sequence[_Topic]) -> tuple[_Topic, _Topic]:
 def _shots(reader: Any, path: Path, topic: str) -> list[Shot]:
     """Return the images of a topic with the times in their headers."""
     shots = []
-    for message, raw in images_of(reader, path, topic):
-        seconds, nanoseconds = struct.unpack_from("<II", raw, 4)  # after a sequence number, or CDR's header
+    for message in images_of(reader, path, topic):
+        seconds, nanoseconds = struct.unpack_from("<II", message.raw, 4)  # after a sequence number, or CDR's header
         stamp = seconds + 1e-9 * nanoseconds if seconds else 1e-9 * message.time
-        shots.append(Shot(Path(f"{path}{topic}"), message, stamp))
+        shots.append(Shot(Path(f"{path}{topic}"), message.source, stamp))
     return shots
 
 

@@ -32,9 +32,9 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.poses import as_rigid
-from dsr.io.captures.archive import PHOTO_LIMIT, Part, decode_photo, inflate, read_section
+from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo, inflate, read_section
 from dsr.io.captures.stray import frames_of_video
-from dsr.io.frames import CaptureFrame, Geometry, Size, stated
+from dsr.io.frames import CaptureFrame, Geometry, Part, Size, stated
 from dsr.io.images import read_numbers
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult, numbered_files, paired
 from dsr.io.trajectories import NO_POSE, USUAL_SIZE, describe_capture, fitting_camera, intrinsics_camera
