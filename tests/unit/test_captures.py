@@ -189,9 +189,8 @@ def test_capture_without_photos_is_refused_and_without_cameras_is_read_as_pictur
     assert found.assumptions[0].text.startswith("like Polycam, without keyframes/cameras/*.json or ")
     for path in folder.glob("scan/keyframes/*images/*"):
         path.unlink()
-    with pytest.raises(ValueError, match="it looks like Polycam, without keyframes/images/") as caught:
+    with pytest.raises(ValueError, match="it looks like Polycam, without keyframes/images/"):
         find_pairs_of_folder(folder)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("suffix", [".r3d", ".sens", ".bag"])
@@ -279,18 +278,14 @@ def test_video_that_ends_early_or_is_none_is_refused(folder):
         read_picture(pairs[0], Reading())
 
 
-def test_lzfse_data_of_the_real_compressor_are_read(folder):
+def test_lzfse_data_of_the_real_compressor_are_read_and_damaged_ones_refused(folder):
     lzfse = pytest.importorskip("lzfse")
     captures.record3d(folder / "scan.r3d", lambda values: lzfse.compress(values.tobytes()))
     np.testing.assert_allclose(read_all(folder)[1].depth_lr[0], captures.depth(1), rtol=1e-6)
-
-
-@pytest.mark.parametrize("content", [b"", b"bvx-" + struct.pack("<I", 1 << 20) + b"x" * 8,
-                                     captures.lzfse_block(np.zeros(5, "u1"))])  # fmt: skip
-def test_lzfse_data_that_are_damaged_or_of_another_size_are_refused(content):
-    pytest.importorskip("lzfse")
-    with pytest.raises(ValueError, match=r"^expected "):
-        decode_lzfse(content, SIZE_LR, "<f4")
+    short = b"bvx-" + struct.pack("<I", 1 << 20) + b"x" * 8
+    for content in (b"", short, captures.lzfse_block(np.zeros(5, "u1"))):
+        with pytest.raises(ValueError, match=r"^expected "):
+            decode_lzfse(content, SIZE_LR, "<f4")
 
 
 def test_missing_package_is_named_with_the_extra_that_has_it(folder, monkeypatch):
@@ -583,38 +578,33 @@ def test_frames_of_scanner_app_without_json_have_no_camera_and_no_pose(folder):
     assert "no camera and no pose" in said(picture)
 
 
-def camera_of(folder):
-    return read_picture(find_pairs_of_folder(folder).pairs[0], Reading()).camera
-
-
-def test_frames_of_a_zed_have_the_camera_of_the_calibration_and_millimetres(tmp_path):
+def test_frames_of_a_zed_have_the_camera_of_the_calibration_of_their_size_and_millimetres(tmp_path):
     pairs = find_pairs_of_folder(captures.zed(tmp_path)).pairs
     assert [pair.name for pair in pairs] == ["000000", "000001", "000002"]
     picture = read_picture(pairs[1], Reading())
     camera = picture.camera
     np.testing.assert_allclose((camera.fx, camera.fy, camera.cx, camera.cy), (700, 700, 650, 355), atol=0.01)
     np.testing.assert_allclose(picture.depth_lr, 1.1)
-
-
-def test_translation_of_a_zed_is_of_each_resolution_or_of_all_or_0_as_the_files_of_each_age_have_it(tmp_path):
-    """An angle of 0.02 between both cameras is 14 pixels, by a part of which the middle of the photo moves."""
-    path = captures.zed(tmp_path, TY_HD=9.0, TZ_HD=-30.0, CV_HD=0.02) / "SN12345.conf"
-    text, each = path.read_text(), camera_of(tmp_path)
-    path.write_text(text.replace("TY_HD", "TY").replace("TZ_HD", "TZ"))
-    assert camera_of(tmp_path) == each
-    path.write_text("".join(line for line in text.splitlines(keepends=True) if not line.startswith(("TY", "TZ"))))
-    without = camera_of(tmp_path)
-    assert without == camera_of(captures.zed(tmp_path, CV_HD=0.02))
-    assert without != each
-    assert 5 < abs(without.cx - 650) < 15
-
-
-def test_photos_of_a_zed_of_another_size_have_no_camera(tmp_path):
-    captures.zed(tmp_path)
     for kind, values in (("left", captures.photo()), ("depth", np.full(captures.SIZE, 900, np.uint16))):
         captures.save(tmp_path / f"{kind}000000.png", values)
-    picture = read_picture(find_pairs_of_folder(tmp_path).pairs[0], Reading())
-    assert any("SN12345.conf is not used" in str(each) for each in picture.assumptions)
+    assert "SN12345.conf is not used" in said(read_picture(pairs[0], Reading()))
+
+
+def test_translation_of_a_zed_is_of_each_resolution_or_of_all_or_0_as_the_files_of_each_age_have_it(folder):
+    """An angle of 0.02 between both cameras is 14 pixels, by a part of which the middle of the photo moves."""
+
+    def camera():
+        return read_all(folder)[0].camera
+
+    path = captures.zed(folder, TY_HD=9.0, TZ_HD=-30.0, CV_HD=0.02) / "SN12345.conf"
+    text, each = path.read_text(), camera()
+    path.write_text(text.replace("TY_HD", "TY").replace("TZ_HD", "TZ"))
+    assert camera() == each
+    path.write_text("".join(line for line in text.splitlines(keepends=True) if not line.startswith(("TY", "TZ"))))
+    without = camera()
+    captures.zed(folder, CV_HD=0.02)
+    assert without == camera() != each
+    assert 5 < abs(without.cx - 650) < 15
 
 
 def packed(path, folder, inside=""):

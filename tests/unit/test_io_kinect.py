@@ -182,36 +182,31 @@ def test_damaged_calibration_is_named_unless_both_cameras_are_given(tmp_path):
     assert middle == pytest.approx(DISTANCE, rel=0.1)
 
 
-@pytest.mark.parametrize(
-    "calibration",
-    [
-        {"CalibrationInformation": {}},
-        [1],
-        changed(lambda cameras: cameras.pop()),
-        changed(lambda cameras: cameras[0]["Intrinsics"].update(ModelType="CALIBRATION_LensDistortionModelTheta")),
-        changed(lambda cameras: cameras[1]["Intrinsics"]["ModelParameters"].pop()),
-        changed(lambda cameras: cameras[1]["Intrinsics"]["ModelParameters"].__setitem__(2, -1.0)),
-        changed(lambda cameras: cameras[1]["Intrinsics"]["ModelParameters"].__setitem__(5, "x")),
-        changed(lambda cameras: cameras[0]["Rt"].update(Rotation=[2.0] * 9)),
-    ],
-    ids=["none", "list", "one camera", "lens", "few", "negative", "text", "rotation"],
-)
-def test_damaged_calibrations_are_refused(tmp_path, calibration):
-    path = write(tmp_path / "scan.mkv", calibration=calibration)
-    with pytest.raises(ValueError, match=r"scan\.mkv: calibration\.json: ") as caught:
-        pictures(path)
-    assert "\n" not in str(caught.value)
+DAMAGED = {
+    "none": {"CalibrationInformation": {}},
+    "list": [1],
+    "one camera": changed(lambda cameras: cameras.pop()),
+    "lens": changed(lambda cameras: cameras[0]["Intrinsics"].update(ModelType="CALIBRATION_LensDistortionModelTheta")),
+    "few": changed(lambda cameras: cameras[1]["Intrinsics"]["ModelParameters"].pop()),
+    "negative": changed(lambda cameras: cameras[1]["Intrinsics"]["ModelParameters"].__setitem__(2, -1.0)),
+    "text": changed(lambda cameras: cameras[1]["Intrinsics"]["ModelParameters"].__setitem__(5, "x")),
+    "rotation": changed(lambda cameras: cameras[0]["Rt"].update(Rotation=[2.0] * 9)),
+    "attachment": (b"calibration.json", b"calibration.text"),
+    "track": (b"DEPTH", b"DEPHT"),
+    "mode": (b"MJPG_480P", b"H264_480P"),
+    "file": (b"\x1a\x45\xdf\xa3", b"\x1a\x45\xdf\xa4"),
+    "photo": (b"\xff\xd8\xff", b"\xff\xd9\xff"),
+}  # calibrations, and bytes of the recording with others
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [(b"calibration.json", b"calibration.text"), (b"DEPTH", b"DEPHT"), (b"MJPG_480P", b"H264_480P"),
-     (b"\x1a\x45\xdf\xa3", b"\x1a\x45\xdf\xa4"), (b"\xff\xd8\xff", b"\xff\xd9\xff")],
-)  # fmt: skip
-def test_damaged_recordings_are_refused(tmp_path, old, new):
-    path = write(tmp_path / "scan.mkv")
-    path.write_bytes(path.read_bytes().replace(old, new))
-    with pytest.raises(ValueError, match=r"scan\.mkv[:/]") as caught:
+@pytest.mark.parametrize("what", DAMAGED)
+def test_damaged_recordings_and_calibrations_are_refused_in_one_line(tmp_path, what):
+    damage = DAMAGED[what]
+    path = write(tmp_path / "scan.mkv", calibration=None if isinstance(damage, tuple) else damage)
+    if isinstance(damage, tuple):
+        path.write_bytes(path.read_bytes().replace(*damage))
+    place = r"scan\.mkv[:/]" if isinstance(damage, tuple) else r"scan\.mkv: calibration\.json: "
+    with pytest.raises(ValueError, match=place) as caught:
         pictures(path)
     assert "\n" not in str(caught.value)
 

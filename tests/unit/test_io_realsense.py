@@ -88,16 +88,11 @@ def test_frames_are_in_the_order_of_their_time_stamps(tmp_path, suffix):
     assert [picture.time for picture in pictures] == pytest.approx([1.0, 1.0333, 1.0666], abs=1e-6)
 
 
-@pytest.mark.parametrize("suffix", WRITERS)
-@pytest.mark.parametrize("unit", [1e-4, 2.5e-4])
-def test_depth_is_in_the_units_of_the_option(tmp_path, suffix, unit):
+@pytest.mark.parametrize(("suffix", "version", "unit"), [(".bag", 4, 1e-4), (".db3", 4, 2.5e-4), (".bag", 2, 5e-4)])
+def test_depth_is_in_the_units_of_the_option_or_of_the_property_of_file_version_2(tmp_path, suffix, version, unit):
     depths = [realsense.seen_by_depth(number, unit) for number in range(captures.FRAMES)]
-    expect_plane(read_all(WRITERS[suffix](tmp_path / f"a{suffix}", Recording(unit=unit, depths=depths))))
-
-
-def test_depth_is_in_the_units_of_the_property_of_file_version_2(tmp_path):
-    depths = [realsense.seen_by_depth(number, 5e-4) for number in range(captures.FRAMES)]
-    expect_plane(read_all(realsense.bag(tmp_path / "a.bag", Recording(version=2, unit=5e-4, depths=depths))))
+    recording = Recording(version=version, unit=unit, depths=depths)
+    expect_plane(read_all(WRITERS[suffix](tmp_path / f"a{suffix}", recording)))
 
 
 @pytest.mark.parametrize("suffix", WRITERS)
