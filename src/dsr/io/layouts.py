@@ -62,14 +62,8 @@ class NoPairError(ValueError):
 def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResult:
     """Return the pairs in a folder of any layout, or in its subfolders, in a capture's file, or in a ZIP file of these.
 
-    Args:
-        folder: folder or file.
-        leave: folder that is skipped, such as that of the results.
-
-    Raises:
-        NoPairError: there is no pair in it.
-        ValueError: there is no such folder, or a capture in it is damaged.
-
+    ``leave`` is a folder that is skipped, such as that of the results. A NoPairError if there is no pair, another
+    ValueError if there is no such folder, or a capture in it is damaged.
     """
     given = folder
     if folder.suffix.lower() == ".zip" and folder.is_file():

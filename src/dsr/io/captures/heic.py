@@ -57,7 +57,11 @@ def read(path: Path) -> PairingResult:
     """Return the pair of a HEIC file."""
     if not has_depth(path):
         raise ValueError(f"{path}: expected a HEIC photo with a depth map, as of portrait mode; there is none")
-    sources, xmp = (_HeicImage(path, "photo"), _HeicImage(path, "depth")), _depth_xmp(path)
+    content = read_limited(path, MOST_FILE)
+    place = content.find(b"http://ns.apple.com/depthData/")  # in XMP text about the map, if there is some
+    first, end = content.rfind(b"<x:xmpmeta", 0, max(place, 0)), content.find(b"</x:xmpmeta>", max(place, 0))
+    xmp = content[first:end] if place >= 0 and first >= 0 and end - first <= MOST_TEXT and end >= 0 else b""
+    sources = _HeicImage(path, "photo"), _HeicImage(path, "depth")
     frame = CaptureFrame(_APP, functools.partial(_geometry, path, xmp), path, xmp, *sources)
     pair = Pair(path.stem, path, path / "depth", unit=1.0, capture=frame)
     return PairingResult((pair,), (Assumption("HEIC photos with depth maps of their own"),))
@@ -84,14 +88,6 @@ def _read_depth(path: Path, stored: Any) -> np.ndarray:
         mapped = low + share * (high - low)
         depth = mapped if kind == _DEPTH else 1 / mapped
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.nan).astype(np.float32)
-
-
-def _depth_xmp(path: Path) -> bytes:
-    """Return the XMP text about the depth map; empty if there is none."""
-    content = read_limited(path, MOST_FILE)
-    place = content.find(b"http://ns.apple.com/depthData/")
-    first, end = content.rfind(b"<x:xmpmeta", 0, max(place, 0)), content.find(b"</x:xmpmeta>", max(place, 0))
-    return content[first:end] if place >= 0 and first >= 0 and end - first <= MOST_TEXT and end >= 0 else b""
 
 
 def _geometry(path: Path, xmp: bytes, size: Size) -> Geometry:

@@ -33,7 +33,7 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 from dsr.geometry.camera import Camera
 from dsr.geometry.poses import as_rigid
 from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo, inflate, read_section
-from dsr.io.captures.stray import frames_of_video
+from dsr.io.captures.stray import VideoFrame, frames_of_video
 from dsr.io.frames import CaptureFrame, Geometry, Part, Size, stated
 from dsr.io.images import read_numbers
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult, numbered_files, paired
@@ -213,7 +213,7 @@ def find_scannetpp(folder: Path) -> PairingResult | None:
     if not maps:
         parts = _parts(packed)
         maps = {number: packed / part.name for number, part in parts.items()}
-    frames, warnings = {}, []
+    frames, warnings = dict[int, VideoFrame](), list[Assumption]()
     if video is not None and not photos and maps:
         photos, frames, warnings = frames_of_video(video, maps)
     both, unpaired = paired(photos, maps)

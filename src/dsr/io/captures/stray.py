@@ -49,7 +49,7 @@ def find(folder: Path) -> PairingResult | None:
         return None
     confidence, rows = numbered_files(folder / "confidence", (".png",)), _read_odometry(odometry)
     text = read_text(matrix) if matrix.is_file() else ""
-    frames, warnings = {}, []
+    frames, warnings = dict[int, VideoFrame](), list[Assumption]()
     if not photos:
         photos, frames, warnings = frames_of_video(video, depths)
     both, unpaired = paired(photos, depths)
