@@ -307,7 +307,7 @@ def test_archive_whose_members_are_too_large_or_of_another_app_is_refused(folder
     for name, content, message in (
         ("metadata", b" " * (1 << 28), "scan.r3d/metadata: expected at most 134217728 bytes, got"),
         ("metadata", b'{"app": "other"}', "metadata: expected Record3D's metadata; w: it is missing"),
-        ("metadata", b"[1", "metadata: expected Record3D's metadata as JSON"),
+        ("metadata", b"[1", "metadata: expected Record3D's metadata; got damaged JSON"),
         ("rgbd/1.depth", bytes(1 << 24), "scan.r3d/rgbd/1.depth: expected at most 66304 bytes, got"),
     ):
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field
 
 from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo, members, read_part
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Part, Size, stated
@@ -30,7 +30,7 @@ from dsr.io.pairs import Pair, PairingResult, numbered_files, paired
 from dsr.io.trajectories import describe_capture, intrinsics_camera, pose_from_quaternion
 from dsr.notes import Assumption
 from dsr.utils.guards import refusing
-from dsr.utils.validation import Whole, describe
+from dsr.utils.validation import Whole, parse_model
 from dsr.utils.versions import how_to_install
 
 _APP = "Record3D"
@@ -71,12 +71,14 @@ def find(folder: Path) -> PairingResult | None:
         "depth": numbered_files(folder / "depth", (".exr",)),
         "conf": numbered_files(folder / "conf", (".exr", ".png")),
     }
-    return _frames(path, _parse(path, content), files, lambda *_: None)
+    metadata = parse_model(_Metadata, content, path, f"expected {_APP}'s metadata; ")
+    return _frames(path, metadata, files, lambda *_: None)
 
 
 def read_archive(path: Path) -> PairingResult:
     """Return the frames of an archive or of an unpacked one."""
-    metadata = _parse(path / "metadata", read_part(path, "metadata", _METADATA_LIMIT))
+    content, place = read_part(path, "metadata", _METADATA_LIMIT), path / "metadata"
+    metadata = parse_model(_Metadata, content, place, f"expected {_APP}'s metadata; ")
     files: dict[str, dict[int, Path]] = {"jpg": {}, "depth": {}, "conf": {}}
     for name in members(path):
         if match := re.fullmatch(r"rgbd/(\d{1,9})\.(jpg|depth|conf)", name):
@@ -94,20 +96,10 @@ def read_archive(path: Path) -> PairingResult:
         fetch = functools.partial(read_part, path, name, PHOTO_LIMIT if kind == "jpg" else most)
         return Part(path, name, fetch, decoders[kind])
 
-    found = _frames(path / "metadata", metadata, files, part)
+    found = _frames(place, metadata, files, part)
     if not found.pairs:
         raise ValueError(f"{path}: expected photos and depth maps of {_APP} in rgbd/, found no pair")
     return found
-
-
-def _parse(path: Path, content: bytes) -> _Metadata:
-    """Return the metadata."""
-    try:
-        return _Metadata.model_validate(json.loads(content))
-    except ValidationError as error:
-        raise ValueError(f"{path}: expected {_APP}'s metadata; {describe(error)}") from error
-    except (ValueError, RecursionError, OverflowError) as error:
-        raise ValueError(f"{path}: expected {_APP}'s metadata as JSON, got something else") from error
 
 
 def _frames(

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, RootModel
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.poses import as_rigid
@@ -40,7 +40,7 @@ from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult, numbered_files, pa
 from dsr.io.trajectories import NO_POSE, USUAL_SIZE, describe_capture, fitting_camera, intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import MOST_TEXT, opened, read_limited, read_text, refusing
-from dsr.utils.validation import describe
+from dsr.utils.validation import parse_model
 from dsr.utils.versions import how_to_install
 
 _BEGINNING, _HEADER, _FRAME = struct.Struct("<IQ"), struct.Struct("<64f2i4IfQ"), struct.Struct("<16f4Q")
@@ -193,7 +193,8 @@ class _Entry(BaseModel, strict=True):
     aligned_pose: Annotated[list[_Row4], Field(min_length=4, max_length=4)] | None = None
 
 
-_ENTRIES = TypeAdapter(dict[str, _Entry])
+class _Entries(RootModel[dict[str, _Entry]]):
+    """The JSON by the names of the frames."""
 
 
 def find_scannetpp(folder: Path) -> PairingResult | None:
@@ -205,11 +206,8 @@ def find_scannetpp(folder: Path) -> PairingResult | None:
     video = next((folder / name for name in _VIDEOS if (folder / name).is_file()), None)
     if not path.is_file() or not (maps or packed.is_file()) or not (photos or video):
         return None
-    with refusing(f"{path}: expected intrinsics and poses of frames as JSON, got something else", RecursionError):
-        try:
-            entries = _ENTRIES.validate_json(read_text(path, _LARGEST_JSON))
-        except ValidationError as error:
-            raise ValueError(f"{path}: expected ScanNet++'s intrinsics and poses; {describe(error)}") from error
+    expected = "expected ScanNet++'s intrinsics and poses; "
+    entries = parse_model(_Entries, read_text(path, _LARGEST_JSON), path, expected).root
     if not maps:
         parts = _parts(packed)
         maps = {number: packed / part.name for number, part in parts.items()}
