@@ -284,7 +284,7 @@ def test_value_that_is_no_number_is_refused_by_file_and_key(tmp_path, write, key
 @pytest.mark.parametrize(("key", "value"), [("w", True), ("K", [True] * 9), ("poses", [["60"] * 7])])
 def test_metadata_of_record3d_with_a_value_that_is_no_number_are_refused(tmp_path, key, value):
     captures.record3d(tmp_path / "scan.r3d", **{key: value})
-    assert key in refusal(tmp_path / "scan.r3d", read_archive, tmp_path)
+    assert key in refusal(tmp_path / "scan.r3d", read_archive, tmp_path / "scan.r3d")
 
 
 @pytest.mark.parametrize("entry", [
