@@ -423,7 +423,7 @@ def scannetpp(folder, kind="lz4"):
     return folder
 
 
-def replica(folder, *, params=True, step=1):
+def replica(folder, *, step=1):
     """Write a scene of Replica as NICE-SLAM renders it: all poses, and one of every few frames."""
     rows = []
     for number in range(FRAMES * step):
@@ -433,10 +433,9 @@ def replica(folder, *, params=True, step=1):
             values = np.round(6553.5 * depth(number // step)).astype(np.uint16)
             save(folder / "results" / f"depth{number:06}.png", values)
     (folder / "traj.txt").write_text("\n".join(rows) + "\n")
-    if params:
-        names = zip(("fx", "fy", "cx", "cy"), INTRINSICS, strict=True)
-        entries = {"camera": {"w": SIZE[1], "h": SIZE[0], **dict(names), "scale": 6553.5}}
-        (folder / "cam_params.json").write_text(json.dumps(entries))
+    names = zip(("fx", "fy", "cx", "cy"), INTRINSICS, strict=True)
+    entries = {"camera": {"w": SIZE[1], "h": SIZE[0], **dict(names), "scale": 6553.5}}
+    (folder / "cam_params.json").write_text(json.dumps(entries))
     return folder
 
 

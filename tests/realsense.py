@@ -67,25 +67,12 @@ def text1(text):
 def bag(path, recording):
     """Write a ``.bag`` of the SDK up to 2.57."""
     from rosbags.rosbag1 import Writer  # noqa: PLC0415 - an extra
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
 
-    store = get_typestore(Stores.ROS1_NOETIC)
-    types = store.types
+    made = captures.RosWriter(1)
     written = []
 
     def add(time, topic, kind, raw):
         written.append((max(int(1e9 * time), 1), topic, kind, raw))
-
-    def info(camera, lens):
-        width, height, fx, fy, cx, cy = camera
-        roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-        header = types["std_msgs/msg/Header"](0, types["builtin_interfaces/msg/Time"](0, 0), "")
-        k = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
-        zeros = {"R": np.zeros(9), "P": np.zeros(12), "binning_x": 0, "binning_y": 0, "roi": roi}
-        kind = types["sensor_msgs/msg/CameraInfo"]
-        message = kind(header=header, height=height, width=width, distortion_model=lens[0], D=np.array(lens[1]), K=k,
-                       **zeros)  # fmt: skip
-        return bytes(store.serialize_ros1(message, kind.__msgtype__))
 
     add(0, "/file_version", "std_msgs/msg/UInt32", struct.pack("<I", recording.version))
     add(0, "/device_0/info", "diagnostic_msgs/msg/KeyValue", text1("Name") + text1(recording.name))
@@ -96,7 +83,9 @@ def bag(path, recording):
         add(0, "/device_0/sensor_0/property", "diagnostic_msgs/msg/KeyValue", value)
     for sensor, kind, camera, lens, turn, shift, encoding, pictures, late in recording.streams():
         stream = f"/device_0/sensor_{sensor}/{kind}_0"
-        add(0, f"{stream}/info/camera_info", "sensor_msgs/msg/CameraInfo", info(camera, lens))
+        width, height, *numbers = camera
+        info = made.info(made.header(), (height, width), numbers, distortion_model=lens[0], d=lens[1])
+        add(0, f"{stream}/info/camera_info", info.__msgtype__, bytes(made.store.serialize_ros1(info, info.__msgtype__)))
         if recording.turn is not None:
             transform = struct.pack("<7d", *shift, *turn.as_quat())
             add(0, f"{stream}/tf/1", "geometry_msgs/msg/Transform", transform)
@@ -110,7 +99,7 @@ def bag(path, recording):
         found = {}
         for time, topic, kind, raw in written:
             if topic not in found:
-                found[topic] = writer.add_connection(topic, kind, typestore=store)
+                found[topic] = writer.add_connection(topic, kind, typestore=made.store)
             writer.write(found[topic], time, raw)
     return path
 

@@ -11,7 +11,7 @@ from scipy.io import savemat
 from dsr.data.matlab import read_variables
 from dsr.evaluation.results import load_prediction
 from dsr.io.cameras import read_any_camera, read_camera
-from dsr.io.captures.record3d import RECORD3D
+from dsr.io.captures.record3d import read_archive
 from dsr.io.depth_files import DEPTH_SUFFIXES, read_depth_file, write_depth_file
 from dsr.io.exports import read_input, write_input
 from dsr.io.images import read_mask
@@ -47,7 +47,7 @@ def read_picture_file(path):
 
 
 def read_capture(path):
-    return [pair.capture.photo.read() for pair in RECORD3D.frames(path).pairs]
+    return [pair.capture.photo.read() for pair in read_archive(path).pairs]
 
 
 READERS = {

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 
+from dsr.io.captures import CAPTURES
 from dsr.io.captures.contract import Capture
-from dsr.io.captures.registry import CAPTURES
 from fuzz import judging, readers
 from fuzz.cases import READERS, Cases
 from fuzz.guard import MARK

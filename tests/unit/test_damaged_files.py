@@ -35,7 +35,7 @@ from dsr.data.matlab import read_variables
 from dsr.evaluation.results import load_errors, load_prediction, prediction_path, sample_path
 from dsr.evaluation.run_files import load_results, read_run
 from dsr.geometry.camera import Camera
-from dsr.io.captures.record3d import RECORD3D
+from dsr.io.captures.record3d import read_archive
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import read_input, write_input
 from dsr.io.inputs import read_picture
@@ -232,7 +232,7 @@ def test_value_of_a_result_that_is_no_number_is_refused_by_its_file(tmp_path, va
 @pytest.mark.parametrize(("key", "value"), [("w", True), ("K", [True] * 9), ("poses", [["60"] * 7])])
 def test_metadata_of_record3d_with_a_value_that_is_no_number_are_refused(tmp_path, key, value):
     captures.record3d(tmp_path / "scan.r3d", **{key: value})
-    assert key in refusal(tmp_path / "scan.r3d", RECORD3D.frames, tmp_path)
+    assert key in refusal(tmp_path / "scan.r3d", read_archive, tmp_path / "scan.r3d")
 
 
 RECORDS = [

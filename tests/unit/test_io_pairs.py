@@ -70,13 +70,8 @@ def test_damaged_tum_list_is_refused_by_file_and_line(tmp_path):
 
 
 def test_nearest_time_is_matched_and_no_depth_map_twice(tmp_path):
-    touch(
-        tmp_path,
-        "rgb/1700000000.000.png",
-        "rgb/1700000000.010.png",
-        "depth/1700000000.008.png",
-        "depth/1699999999.9.png",
-    )
+    touch(tmp_path, "rgb/1700000000.000.png", "rgb/1700000000.010.png")
+    touch(tmp_path, "depth/1700000000.008.png", "depth/1699999999.9.png")
     found = find_pairs_of_folder(tmp_path)
     assert pairs(found, tmp_path) == [("rgb/1700000000.010.png", "depth/1700000000.008.png")]
     assert len(found.unpaired) == 2
@@ -118,10 +113,8 @@ def test_subfolders_are_searched_but_not_the_results(tmp_path):
     touch(tmp_path, "x/rgb/1.png", "x/depth/1.png", "x/intrinsics.txt", "y/deep/color_1.png", "y/deep/depth_1.png")
     touch(tmp_path, "out/color_7.png", "out/depth_7.png", "camera.json")
     found = find_pairs_of_folder(tmp_path, tmp_path / "out")
-    assert [(pair.name, pair.camera.name) for pair in found.pairs] == [
-        ("x/1", "intrinsics.txt"),
-        ("y/deep/color_1", "camera.json"),
-    ]
+    named = [(pair.name, pair.camera.name) for pair in found.pairs]
+    assert named == [("x/1", "intrinsics.txt"), ("y/deep/color_1", "camera.json")]
     assert [assumption.text for assumption in found.assumptions] == ["folders rgb and depth"]
     assert len(find_pairs_of_folder(tmp_path).pairs) == 3
 
@@ -149,11 +142,8 @@ def test_file_lists_are_paired_in_order_with_distinct_names(tmp_path):
         [tmp_path / name for name in names] for names in (("a/p.jpg", "b/p.jpg", "q.jpg"), ("3.png", "1.png", "2.png"))
     )
     found = find_pairs_of_lists(photos, depths)
-    assert [(pair.name, pair.depth.name) for pair in found.pairs] == [
-        ("a_p", "3.png"),
-        ("b_p", "1.png"),
-        ("q", "2.png"),
-    ]
+    named = [(pair.name, pair.depth.name) for pair in found.pairs]
+    assert named == [("a_p", "3.png"), ("b_p", "1.png"), ("q", "2.png")]
     assert [pair.camera for pair in found.pairs] == [None, None, tmp_path / "camera.json"]
     assert [pair.name for pair in find_pairs_of_lists(photos[:1] * 2, depths[:2]).pairs] == ["a_p", "a_p_2"]
 

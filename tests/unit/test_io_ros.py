@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from captures import FRAMES, INTRINSICS, SIZE
 
-from dsr.geometry.camera import Camera
-from dsr.io.captures.ros_images import decode_message
+from dsr.geometry.camera import Camera, Lens
+from dsr.io.captures.bags import decode_message
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.reading import CameraChoice, Reading
@@ -24,23 +24,22 @@ def read_first(path):
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_window_and_binning_of_the_sensor_are_taken_off_the_camera(tmp_path, version):
-    """The calibration is of 200 x 120 pixels, of which the photo shows 128 x 96 from (30, 10) on, 2 x 2 as one."""
-    k = [100.0, 0, 93.5, 0, 102.0, 58.5, 0, 0, 1]
-    path = captures.ros(tmp_path / "a.bag" if version == 1 else tmp_path / "a", version, k=k, width=200, height=120,
-                        roi=(30, 10, 128, 96), binning_x=2, binning_y=2)  # fmt: skip
-    # centres of the first and of the 64th pair of columns are at 30.5 and 156.5
-    camera = read_first(path).camera
-    assert camera == Camera(64, 48, 50.0, 51.0, (93.5 - 30.5) / 2, (58.5 - 10.5) / 2)
-
-
-@pytest.mark.parametrize("version", [1, 2])
-def test_photos_of_a_rectified_topic_have_the_projection_and_no_distortion(tmp_path, version):
-    p = [40.0, 0, 30, -4, 0, 41, 22, 0, 0, 0, 1, 0]
-    path = captures.ros(tmp_path / "a.bag" if version == 1 else tmp_path / "a", version, p=p, d=[0.3, 0.1, 0, 0, 0],
-                        image_name="image_rect_color")  # fmt: skip
+@pytest.mark.parametrize(
+    ("of_info", "expected"),
+    [
+        # of 200 x 120 pixels the photo shows 128 x 96 from (30, 10) on, 2 x 2 as one: the centres of the first and of
+        # the 64th pair of columns are at 30.5 and 156.5
+        ({"k": [100.0, 0, 93.5, 0, 102.0, 58.5, 0, 0, 1], "width": 200, "height": 120, "roi": (30, 10, 128, 96),
+          "binning_x": 2, "binning_y": 2}, (50.0, 51.0, (93.5 - 30.5) / 2, (58.5 - 10.5) / 2)),
+        # of a rectified topic that of P, without distortion
+        ({"p": [40.0, 0, 30, -4, 0, 41, 22, 0, 0, 0, 1, 0], "d": [0.3, 0.1, 0, 0, 0],
+          "image_name": "image_rect_color"}, (40.0, 41.0, 30.0, 22.0)),
+    ],
+)  # fmt: skip
+def test_camera_is_that_of_the_part_and_the_topic_that_the_photo_is_of(tmp_path, version, of_info, expected):
+    path = captures.ros(tmp_path / "a.bag" if version == 1 else tmp_path / "a", version, **of_info)
     picture = read_first(path)
-    assert picture.camera == Camera(64, 48, 40.0, 41.0, 30.0, 22.0)
+    assert picture.camera == Camera(64, 48, *expected)
     np.testing.assert_array_equal(np.rint(255 * picture.rgb.permute(1, 2, 0).numpy()), captures.photo())
 
 
@@ -52,28 +51,13 @@ def test_photos_of_a_rectified_topic_have_the_projection_and_no_distortion(tmp_p
         ("equidistant", (-0.05, 0.02, -0.01, 0.002)),
     ],
 )
-def test_photos_with_distortion_become_those_of_the_pinhole_camera(tmp_path, model, numbers):
-    fx, fy, cx, cy = INTRINSICS
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    v, u = np.mgrid[: SIZE[0], : SIZE[1]].astype(float)
-    points = np.stack((u, v), -1).reshape(-1, 1, 2)
-    project = cv2.fisheye.projectPoints if model == "equidistant" else cv2.projectPoints
-    ideal, zero = points.copy(), np.zeros((3, 1))
-    for _ in range(60):
-        ray = np.concatenate(((ideal - (cx, cy)) / (fx, fy), np.ones((len(points), 1, 1))), -1)
-        ideal += 0.7 * (points - project(ray, zero, zero, matrix, np.array(numbers))[0])
-    place = ideal.reshape(*SIZE, 2)
-
-    def pattern(x, y):
-        return np.stack((60 + x, 40 + 2 * y, 20 + x + y), -1)
-
-    distorted = np.clip(np.rint(pattern(place[..., 0], place[..., 1])), 0, 255).astype(np.uint8)
-    path = captures.ros(tmp_path / "a", 2, photos=lambda _: distorted, distortion_model=model, d=numbers)
-    picture = read_first(path)
+def test_photos_have_the_lens_of_camera_info_which_is_undone(tmp_path, model, numbers):
+    [pair, *_] = find_pairs_of_folder(captures.ros(tmp_path / "a", 2, distortion_model=model, d=numbers)).pairs
+    name = "kannala_brandt" if model == "equidistant" else "brown_conrady"
+    geometry = pair.capture.geometry_of(SIZE)
+    assert (geometry.camera, geometry.lens) == (CAMERA, Lens(name, numbers))
+    picture = read_picture(pair, Reading())
     assert picture.camera == CAMERA
-    found = 255 * picture.rgb.permute(1, 2, 0).numpy()
-    assert np.abs(distorted - pattern(u, v))[6:-6, 6:-6].max() > 3
-    assert np.abs(found - pattern(u, v))[6:-6, 6:-6].max() < 1.5
     assert any(f"{numbers[0]:g}" in str(fact) for fact in picture.assumptions)
 
 
@@ -126,11 +110,11 @@ def test_file_of_ros_2_is_read_without_its_folder(tmp_path, suffix):
         find_pairs_of_folder(alone)
 
 
-def message(values, *, floats=False):
-    a, b = (20_000.0, 3.0) if floats else (0.0, 0.0)
-    data = struct.pack("<iff", 0, a, b) + (values if isinstance(values, bytes) else captures.rvl(values))
-    kind = "32FC1" if floats else "16UC1"
-    return SimpleNamespace(format=f"{kind}; compressedDepth rvl", data=np.frombuffer(data, np.uint8))
+def message(content, *, floats=False, kind="rvl"):
+    """A message of compressedDepth; floats are stored as a / z + b, rounded, behind the two numbers."""
+    data = struct.pack("<iff", 0, *((20_000.0, 3.0) if floats else (0.0, 0.0))) + content
+    layout = f"{'32FC1' if floats else '16UC1'}; compressedDepth {kind}"
+    return SimpleNamespace(format=layout, data=np.frombuffer(data, np.uint8))
 
 
 def maps():
@@ -150,13 +134,15 @@ def test_topic_of_compressed_depth_is_read(tmp_path):
     np.testing.assert_allclose(read_picture(found[2], Reading()).depth_lr[0], captures.depth(2), atol=6e-4)
 
 
+@pytest.mark.parametrize("kind", ["rvl", "png"])
 @pytest.mark.parametrize("name", maps())
-def test_rvl_is_decoded(name):
+def test_compressed_depth_is_decoded(name, kind):
     values = maps()[name]
-    found = decode_message(message(values))
+    content = captures.rvl(values) if kind == "rvl" else cv2.imencode(".png", values)[1].tobytes()
+    found = decode_message(message(content, kind=kind))
     assert found.dtype == np.uint16
     np.testing.assert_array_equal(found, values)
-    metres = decode_message(message(values, floats=True))
+    metres = decode_message(message(content, floats=True, kind=kind))
     expected = np.where(values > 0, 20_000 / np.where(values == 3, np.nan, values - 3.0), np.nan)
     np.testing.assert_allclose(metres, expected, rtol=1e-6)
 
@@ -173,6 +159,8 @@ def test_rvl_that_is_damaged_or_declares_more_than_it_can_hold_is_refused_before
         with pytest.raises(ValueError, match="expected ") as caught:
             decode_message(message(wrong))
         assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match=r"^expected depth as a 16-bit PNG \(compressedDepth\), got 40 bytes"):
+        decode_message(message(b"\x89PNG".ljust(28), kind="png"))
 
 
 @pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
@@ -193,25 +181,6 @@ def test_recording_whose_files_are_packed_whole_is_read_and_leaves_nothing(tmp_p
     content.write_bytes(content.read_bytes()[:-40])
     with pytest.raises(ValueError, match=f"^{path}: expected a recording of ROS"):
         find_pairs_of_folder(path)
-
-
-@pytest.mark.parametrize("floats", [False, True])
-def test_compressed_depth_of_ros_is_decoded(floats):
-    """Floats are stored as a / z + b, rounded, behind the two numbers of this quantisation."""
-    a, b = 20_000.0, 3.0
-    stored = np.round(a / captures.depth() + b).astype(np.uint16) if floats else captures.millimetres()
-    stored[0, 0] = 0
-    header = struct.pack("<iff", 0, a if floats else 0, b if floats else 0)
-    data = header + cv2.imencode(".png", stored)[1].tobytes()
-    kind = "32FC1" if floats else "16UC1"
-    message = SimpleNamespace(format=f"{kind}; compressedDepth png", data=np.frombuffer(data, np.uint8))
-    values = decode_message(message)
-    expected = captures.depth() * (1 if floats else 1000)
-    expected[0, 0] = np.nan if floats else 0
-    np.testing.assert_allclose(values, expected, rtol=1e-3)
-    message.data = message.data[:40]
-    with pytest.raises(ValueError, match=r"^expected depth as a 16-bit PNG \(compressedDepth\), got 40 bytes"):
-        decode_message(message)
 
 
 @pytest.mark.parametrize(("encoding", "order"), [("rgb8", (0, 1, 2)), ("bgr8", (2, 1, 0)), ("rgba8", (0, 1, 2, 0))])

@@ -83,7 +83,7 @@ def add_commands(parser: argparse.ArgumentParser) -> None:
 
 def show_formats(request: FormatsRequest, console: Console) -> list[str]:
     """Print the formats that are read."""
-    from dsr.io.captures.registry import all_captures  # noqa: PLC0415 - it takes seconds to import
+    from dsr.io.captures import all_captures  # noqa: PLC0415 - only this command needs it
 
     words, known = [word.lower() for word in request.names], all_captures()
     found = [

@@ -32,30 +32,41 @@ _Arguments = ParamSpec("_Arguments")
 class Source:
     """A photo or a map inside a file: a frame of a video, a member of an archive, a message of a recording.
 
-    Kinds of sources are frozen dataclasses, which other processes read from the file anew. Those whose pixels depend on
-    bytes of their own have a ``name``, ``content`` and ``decode``.
+    Kinds of sources are frozen dataclasses, which other processes read from the file anew.
+    """
+
+    file: Path
+
+    def read(self) -> np.ndarray:
+        """Return the pixels: (H, W, 3) uint8 RGB of a photo, (h, w) stored values of a map."""
+        raise NotImplementedError
+
+    def record(self) -> Record:
+        """Return what identifies the content."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Part(Source):
+    """Bytes of a file that ``fetch`` returns, and of which ``decode`` makes pixels; its errors need not name the file.
+
+    Both are functions of modules or partial ones, as other processes get them.
     """
 
     file: Path
     name: str
+    fetch: Callable[[], bytes]
+    decode: Callable[[bytes], np.ndarray]
 
     def read(self) -> np.ndarray:
-        """Return the pixels: (H, W, 3) uint8 RGB of a photo, (h, w) stored values of a map."""
-        content = self.content()
+        """Return the pixels."""
+        content = self.fetch()
         with naming(self.file / self.name):
             return self.decode(content)
 
     def record(self) -> Record:
-        """Return what identifies the content."""
-        return {"file": f"{self.file.name}/{self.name}", "sha256": hashlib.sha256(self.content()).hexdigest()}
-
-    def content(self) -> bytes:
-        """Return the bytes in the file."""
-        raise NotImplementedError
-
-    def decode(self, content: bytes) -> np.ndarray:
-        """Return the pixels that the bytes stand for; the message of a ValueError needs no name of the file."""
-        raise NotImplementedError
+        """Return the name and a hash of the bytes."""
+        return {"file": f"{self.file.name}/{self.name}", "sha256": hashlib.sha256(self.fetch()).hexdigest()}
 
 
 class Rig(NamedTuple):
@@ -69,22 +80,18 @@ class Rig(NamedTuple):
 class Geometry(NamedTuple):
     """Cameras, lenses and poses of a frame as its capture states them; None where it does not.
 
-    ``camera``: of a size of its own, which is scaled to the photo's. ``pose``: camera to world, (4, 4) float64 in
-    metres, rigid, of the camera's frame x right, y down, z forward; the world's frame is the capture's own.
-    ``lens``: of the photo, and of a depth map without a rig, which lies in the photo's pixels. ``rig``: the depth map's
-    own camera, of a size of its own as well; None if the map is in the photo's view. ``up``: the axis of the world that
-    points up, one of :data:`UPS`. ``damage``: what is wrong with the capture's cameras, which does not matter if others
-    are given. ``apart``: why a depth map that is not in the photo's view is of no use without a given rig.
+    ``pose``: camera to world, (4, 4) float64 in metres, rigid, of the camera's frame x right, y down, z forward; the
+    world's frame is the capture's own.
     """
 
-    camera: Camera | None = None
+    camera: Camera | None = None  # of a size of its own, which is scaled to the photo's
     pose: np.ndarray | None = None
     assumptions: tuple[Assumption, ...] = ()
-    lens: Lens | None = None
-    rig: Rig | None = None
-    up: str = ""
-    damage: str = ""
-    apart: str = ""
+    lens: Lens | None = None  # of the photo, and of a depth map without a rig, which lies in the photo's pixels
+    rig: Rig | None = None  # the depth map's camera, of a size of its own as well; None if it is in the photo's view
+    up: str = ""  # the axis of the world that points up, one of UPS
+    damage: str = ""  # what is wrong with the capture's cameras, which does not matter if others are given
+    apart: str = ""  # why a depth map that is not in the photo's view is of no use without a given rig
 
 
 def stated(read: Callable[_Arguments, Geometry], *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> Geometry:

@@ -96,40 +96,29 @@ class FolderUnits:
 
 @dataclass(frozen=True)
 class Picture:
-    """A pair of photo and depth map as tensors.
+    """A pair of photo and depth map as tensors."""
 
-    Args:
-        rgb: (3, H, W) float32 in [0, 1].
-        depth_lr: (1, h, w) float32 orthogonal depth in metres, NaN in holes.
-        camera: camera of the photo's pixels.
-        encoding: encoding of the depth file.
-        assumptions: assumptions about the files.
-        pose: from camera to world, (4, 4) float64 in metres, of a camera with the axes x right, y down, z forward, in
-            the world of the capture; None where there is none.
-        confidence: (1, h, w) float32 from 0 to 1, of the low-resolution map; None where there is none.
-        device_name: of the app or the device, as the files state it; empty where they do not.
-        up: the axis of the world that points up, one of :data:`dsr.io.frames.UPS`.
-        time: of the frame in seconds, as the capture or the files' names have it; None where they have none.
-
-    """
-
-    rgb: Tensor
-    depth_lr: Tensor
-    camera: Camera
-    encoding: Encoding
+    rgb: Tensor  # (3, H, W) float32 in [0, 1]
+    depth_lr: Tensor  # (1, h, w) float32 orthogonal depth in metres, NaN in holes
+    camera: Camera  # of the photo's pixels
+    encoding: Encoding  # of the depth file
     assumptions: tuple[Assumption, ...]
-    pose: np.ndarray | None = None
-    confidence: Tensor | None = None
-    device_name: str = ""
-    up: str = ""
-    time: float | None = None
+    pose: np.ndarray | None = None  # camera (x right, y down, z forward) to the capture's world, (4, 4) float64, metres
+    confidence: Tensor | None = None  # (1, h, w) float32 from 0 to 1, of the low-resolution map
+    device_name: str = ""  # of the app or the device, as the files state it
+    up: str = ""  # the axis of the world that points up, one of dsr.io.frames.UPS
+    time: float | None = None  # in seconds, as the capture or the files' names have it
 
 
 def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None) -> Picture:
     """Return a pair of files as tensors, read as the user says; ``units`` are those of the whole folder."""
     stored = _stored(pair)
     size_lr: Size = (stored.shape[0], stored.shape[1])
-    pixels, notes = _photo(pair, size_lr)
+    source, notes = None if pair.capture is None else pair.capture.photo, list[Assumption]()
+    if source is not None:
+        pixels = source.read()
+    else:
+        pixels, notes = read_photo(pair.rgb, size_lr)
     size: Size = (pixels.shape[0], pixels.shape[1])
     geometry, damaged = read_geometry(pair, size, reading)
     described = _camera(pair, reading, geometry, size, size_lr, notes)
@@ -148,7 +137,13 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     stored, holes, range_type = values.stored, values.holes, values.encoding.range_type
     notes += [*values.notes, *values.hole_notes]
     if pair.mask is not None:
-        holes |= ~_mask(pair.mask, size_lr)
+        mask = read_mask(pair.mask, pixels_beside(*size_lr))
+        if mask.shape != size_lr:
+            raise ValueError(
+                f"{pair.mask}: expected a mask of the depth map's {size_lr[1]} x {size_lr[0]} pixels (width x height), "
+                f"got {mask.shape[1]} x {mask.shape[0]}"
+            )
+        holes |= ~mask
     confidence, confident = _confidence(pair, reading, size_lr, holes)
     expect_known(pair.depth, stored, holes)
     lens_lr = lens if rig is None else rig.lens
@@ -237,7 +232,10 @@ def _interpret(
 ) -> _Values:
     """Return what the values of a pair's map are, (h, w), which ``camera`` has taken."""
     range_type, notes = _range_type(pair, reading, described)
-    meaning = _unit(pair, reading, described, range_type, stored, units, camera)
+    hole_value = described.hole_value if reading.hole_value is None else reading.hole_value
+    meaning = _unit(pair, reading, described, range_type, stored)
+    if meaning is None:
+        meaning = units.interpret(pair, stored, hole_value, camera, may_fall=range_type is None)
     range_type = meaning.range_type or range_type or "orthogonal"
     if range_type == "disparity" and camera.baseline is None:
         raise ValueError(f"{pair.depth}: disparities need the distance between the two cameras: --baseline METRES")
@@ -245,18 +243,13 @@ def _interpret(
         stored = turn_back_bits(str(pair.depth), stored, meaning.bits)
     above = stored.shape[1] / meaning.unit if range_type == "disparity" else 0.0
     above = math.inf if reading.hole_value == 0 else above
-    holes, mark, hole_notes = find_holes(stored, _hole_value(reading, described), above=above)
+    holes, mark, hole_notes = find_holes(stored, hole_value, above=above)
     if range_type == "disparity" and reading.metres is None and meaning.unit == 1:
         expect_narrow(str(pair.depth), stored[~holes], camera)
     inside = pair.capture is not None and pair.capture.depth is not None
     suffix = ".npy" if inside or _is_icl(pair) else pair.depth.suffix.lower()  # the others cannot be written
     encoding = Encoding(suffix, str(stored.dtype), meaning.unit, mark, range_type)
     return _Values(stored, holes, encoding, [*notes, *meaning.assumptions], hole_notes)
-
-
-def _hole_value(reading: Reading, described: CameraFile) -> float | None:
-    """Return an additional value of holes."""
-    return described.hole_value if reading.hole_value is None else reading.hole_value
 
 
 def _stored(pair: Pair) -> np.ndarray:
@@ -278,13 +271,6 @@ def _expect_distances(path: Path, depth_lr: Tensor, holes: np.ndarray, range_typ
     return [
         Assumption(f"depths nearer than {NEAREST:g} m or farther than {FARTHEST:g} m count as holes", f"{lost:.1%}")
     ]
-
-
-def _photo(pair: Pair, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]:
-    """Return the photo, (H, W, 3) uint8 RGB, and the assumptions."""
-    if pair.capture is not None and pair.capture.photo is not None:
-        return pair.capture.photo.read(), []
-    return read_photo(pair.rgb, size_lr)
 
 
 def _is_icl(pair: Pair) -> bool:
@@ -417,17 +403,6 @@ def _camera_source(pair: Pair, reading: Reading) -> str:
     return str(reading.camera.file or capture or pair.camera or pair.rgb)
 
 
-def _mask(path: Path, size: Size) -> np.ndarray:
-    """Return the valid mask in a file, (h, w) bool."""
-    mask = read_mask(path, pixels_beside(*size))
-    if mask.shape != size:
-        raise ValueError(
-            f"{path}: expected a mask of the depth map's {size[1]} x {size[0]} pixels (width x height), "
-            f"got {mask.shape[1]} x {mask.shape[0]}"
-        )
-    return mask
-
-
 def _range_type(pair: Pair, reading: Reading, described: CameraFile) -> tuple[RangeType | None, list[Assumption]]:
     """Return the range type that the user gives, else that of the file's name, else that of the camera file, if any."""
     if reading.range_type is not None:
@@ -443,10 +418,9 @@ def _range_type(pair: Pair, reading: Reading, described: CameraFile) -> tuple[Ra
 
 
 def _unit(
-    pair: Pair, reading: Reading, described: CameraFile, range_type: RangeType | None,
-    stored: np.ndarray, units: FolderUnits, camera: Camera,
-) -> Meaning:  # fmt: skip
-    """Return metres per value, or pixels per value of disparities, and the assumptions."""
+    pair: Pair, reading: Reading, described: CameraFile, range_type: RangeType | None, stored: np.ndarray
+) -> Meaning | None:
+    """Return metres per value, or pixels per value of disparities, and the assumptions; None if nobody states them."""
     if reading.metres is not None:
         turned = reading.unit == "sunrgbd"
         return Meaning(reading.metres, (Assumption(TURNED_BACK),) if turned else (), bits=SUNRGBD_BITS if turned else 0)
@@ -458,7 +432,4 @@ def _unit(
         return Meaning(unit, (Assumption(f"unit: {show_length(unit)} per value, by the camera file"),))
     if pair.unit is not None:
         return Meaning(pair.unit, (), bits=pair.bits)
-    if _is_icl(pair):
-        return Meaning(1e-2, ())
-    hole_value = _hole_value(reading, described)
-    return units.interpret(pair, stored, hole_value, camera, may_fall=range_type is None)
+    return Meaning(1e-2, ()) if _is_icl(pair) else None

@@ -1,6 +1,6 @@
 """Pairs of photo and depth map in folders of any layout: of recording apps, data sets, or one's own.
 
-The layouts are: a capture (:mod:`dsr.io.captures.registry`), which may be a single file, too; a scene of dsr
+The layouts are: a capture (:mod:`dsr.io.captures`), which may be a single file, too; a scene of dsr
 (``rgb.png``, ``camera.json`` and ``depth*`` or ``disparity*``); lists of TUM RGB-D (``rgb.txt`` and ``depth.txt``,
 https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats); two folders named for photos and depth maps; and files
 side by side, distinguished by their names or contents. To these a model of COLMAP or a trajectory of Open3D may add
@@ -20,24 +20,23 @@ import cv2
 import numpy as np
 
 from dsr.io.cameras import read_any_camera
+from dsr.io.captures import CAPTURE_FILES, find_capture, lacking
 from dsr.io.captures.archive import unpack
-from dsr.io.captures.colmap import add_model, find_colmap, model_file
-from dsr.io.captures.nerfstudio import add_transforms
-from dsr.io.captures.registry import CAPTURE_FILES, find_capture, lacking
+from dsr.io.captures.colmap import add_model, add_transforms, find_colmap, model_file
 from dsr.io.depth_files import DEPTH_SUFFIXES
-from dsr.io.frames import CaptureFrame, Geometry
+from dsr.io.frames import CaptureFrame, Geometry, file_state
 from dsr.io.images import read_pixels
 from dsr.io.pairs import (
     Pair,
     PairingResult,
     find_camera_file,
     find_pairs_of_two_folders,
-    has_pictures,
     is_registered,
     list_pictures,
     make_names_unique,
     match_pairs,
     match_times,
+    picture_names,
     role_of,
     role_of_words,
     words_of,
@@ -62,18 +61,12 @@ class NoPairError(ValueError):
 def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResult:
     """Return the pairs in a folder of any layout, or in its subfolders, in a capture's file, or in a ZIP file of these.
 
-    Args:
-        folder: folder or file.
-        leave: folder that is skipped, such as that of the results.
-
-    Raises:
-        NoPairError: there is no pair in it.
-        ValueError: there is no such folder, or a capture in it is damaged.
-
+    ``leave`` is a folder that is skipped, such as that of the results. A NoPairError if there is no pair, another
+    ValueError if there is no such folder, or a capture in it is damaged.
     """
     given = folder
     if folder.suffix.lower() == ".zip" and folder.is_file():
-        folder = unpack(folder)
+        folder = unpack(folder, file_state(folder, "an archive"))
         while len(inside := list(folder.iterdir())) == 1 and inside[0].is_dir():
             folder = inside[0]
     if folder.is_file():
@@ -234,7 +227,7 @@ def _role_folders(folder: Path) -> PairingResult:
     named: dict[str, list[Path]] = {"rgb": [], "depth": [], "other": []}
     for path in sorted(folder.iterdir(), key=lambda path: (not is_registered(path.name), len(path.name), path.name)):
         role = role_of_words(words_of(path.name)) if path.is_dir() else None
-        if role is not None and has_pictures(path):
+        if role is not None and any(picture_names(path)):
             named[role].append(path)
     if not named["rgb"] or not named["depth"]:
         return PairingResult(())

@@ -1,4 +1,4 @@
-"""Pairs of photo and depth map: from lists of files, and from two folders by the names in them."""
+"""Pairs of photo and depth map: from lists of files, two folders by names, and recordings by time."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 from dsr.io.depth_files import READ_SUFFIXES
-from dsr.io.frames import CONFIDENCE_SUFFIXES, CaptureFrame, ConfidenceMap, find_highest
+from dsr.io.frames import CONFIDENCE_SUFFIXES, CaptureFrame, ConfidenceMap, Source, find_highest
 from dsr.io.photos import HEIC_SUFFIXES
 from dsr.notes import Assumption
-from dsr.utils.guards import natural_key
+from dsr.utils.guards import naming, natural_key
 
 Role = Literal["rgb", "depth", "other"]
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm", *HEIC_SUFFIXES)
@@ -94,28 +94,30 @@ def in_order(paths: Iterable[Path]) -> list[Path]:
     return named if None in times.values() else sorted(named, key=lambda path: times[path] or 0.0)
 
 
-def match_names(photos: Iterable[Path], depths: Iterable[Path]) -> list[tuple[Path, Path]]:
-    """Return the pairs among photos and depth maps, in the photos' order.
+def match_pairs(photos: Iterable[Path], depths: Iterable[Path], camera: Path | None = None) -> PairingResult:
+    """Return the pairs among photos and depth maps by name, in the photos' order, all of one camera.
 
     A pair has the same name but for words such as color and depth and for leading zeros; where a name is a time, the
     nearest within 20 ms that no other pair takes. A single photo and a single depth map are a pair whatever they are
     called. If names call some depth maps registered, only these are taken.
     """
-    depths = list(depths)
-    depths = [path for path in depths if is_registered(path.stem)] or depths
-    photos, depths = in_order(photos), in_order(depths)
-    if len(photos) == len(depths) == 1:
-        return [(photos[0], depths[0])]
-    by_key: dict[tuple[str, ...], list[Path]] = {}
-    for path in depths:
-        by_key.setdefault(key_of(path), []).append(path)
-    partner = {path: by_key[key_of(path)].pop(0) for path in photos if by_key.get(key_of(path))}
-    used = set(partner.values())
-    left, alone = [path for path in photos if path not in partner], [path for path in depths if path not in used]
-    times = ([math.nan if (time := time_of(path)) is None else time for path in each] for each in (left, alone))
-    for place, other in match_times(*times):
-        partner[left[place]] = alone[other]
-    return [(path, partner[path]) for path in photos if path in partner]
+    photos, depths = list(photos), list(depths)
+    left = in_order(photos)
+    right = in_order([path for path in depths if is_registered(path.stem)] or depths)
+    if len(left) == len(right) == 1:
+        partner = {left[0]: right[0]}
+    else:
+        by_key: dict[tuple[str, ...], list[Path]] = {}
+        for path in right:
+            by_key.setdefault(key_of(path), []).append(path)
+        partner = {path: by_key[key_of(path)].pop(0) for path in left if by_key.get(key_of(path))}
+        used = set(partner.values())
+        lone, alone = [path for path in left if path not in partner], [path for path in right if path not in used]
+        times = ([math.nan if (time := time_of(path)) is None else time for path in each] for each in (lone, alone))
+        partner |= {lone[place]: alone[other] for place, other in match_times(*times)}
+    pairs = tuple(Pair(path.stem, path, partner[path], camera) for path in left if path in partner)
+    used = {*partner, *partner.values()}
+    return PairingResult(pairs, (), tuple(path for path in (*photos, *depths) if path not in used))
 
 
 def match_times(photos: Sequence[float], depths: Sequence[float]) -> list[tuple[int, int]]:
@@ -154,33 +156,19 @@ def paired(photos: Mapping[_Key, Path], depths: Mapping[_Key, Path]) -> tuple[li
 
 @dataclass(frozen=True)
 class Pair:
-    """Two files of one view.
+    """Two files of one view; names of their places in a capture that has no such files."""
 
-    Args:
-        name: name of the result, unique among the pairs found together.
-        rgb, depth: files of the photo and the depth map; names of their places in a capture that has no such files.
-        camera: camera file beside them.
-        mask: picture that is 0 where depth is missing.
-        unit: metres per value if the layout defines it.
-        factor: upsampling factor if the file's name has it, as in ``depth_lr4.npy``.
-        capture: what the capture that the pair is of says about it.
-        confidence: where its confidence map is.
-        bits: how far the layout turns values of 16 bits to the left; the unit holds after turning them back.
-        time: of the photo in seconds, if the capture or a list of the files states it.
-
-    """
-
-    name: str
+    name: str  # of the result, unique among the pairs found together
     rgb: Path
     depth: Path
-    camera: Path | None = None
-    mask: Path | None = None
-    unit: float | None = None
-    factor: int | None = None
-    capture: CaptureFrame | None = field(default=None, compare=False)
+    camera: Path | None = None  # camera file beside them
+    mask: Path | None = None  # picture that is 0 where depth is missing
+    unit: float | None = None  # metres per value if the layout defines it
+    factor: int | None = None  # of upsampling if the file's name has it, as in depth_lr4.npy
+    capture: CaptureFrame | None = field(default=None, compare=False)  # what the capture that it is of says about it
     confidence: ConfidenceMap | None = field(default=None, compare=False)
-    bits: int = 0
-    time: float | None = None
+    bits: int = 0  # how far the layout turns values of 16 bits to the left; the unit holds after turning them back
+    time: float | None = None  # of the photo in seconds, if the capture or a list of the files states it
 
     @property
     def named_time(self) -> float | None:
@@ -216,20 +204,13 @@ def find_pairs_of_lists(photos: Sequence[Path], depths: Sequence[Path], masks: S
     if len(photos) != len(depths) or len(masks) not in (0, len(photos)):
         counts = f"{len(photos)} for --rgb, {len(depths)} for --depth" + (f", {len(masks)} for --mask" if masks else "")
         raise ValueError(f"expected as many depth maps (and masks, if any) as photos, got {counts}")
-    pairs = [
-        Pair(rgb.stem, rgb, depth, find_camera_file(rgb.parent, _common_folder(rgb, depth)))
-        for rgb, depth in zip(photos, depths, strict=True)
-    ]
-    if masks:
-        pairs = [replace(pair, mask=mask) for pair, mask in zip(pairs, masks, strict=True)]
+    pairs = []
+    for place, (rgb, depth) in enumerate(zip(photos, depths, strict=True)):
+        folders = rgb.parent.absolute(), depth.parent.absolute()
+        beside = folders[0] != folders[1] and folders[0].parent == folders[1].parent  # their camera file may be above
+        camera = find_camera_file(rgb.parent, rgb.parent.parent if beside and rgb.parent.name else rgb.parent)
+        pairs.append(Pair(rgb.stem, rgb, depth, camera, masks[place] if masks else None))
     return PairingResult(make_names_unique(pairs))
-
-
-def _common_folder(rgb: Path, depth: Path) -> Path:
-    """Return up to which folder a photo's camera file is searched: that of two folders side by side, or its own."""
-    folders = rgb.parent.absolute(), depth.parent.absolute()
-    beside = folders[0] != folders[1] and folders[0].parent == folders[1].parent
-    return rgb.parent.parent if beside and rgb.parent.name else rgb.parent
 
 
 def find_pairs_of_two_folders(photos: Path, depths: Path, masks: Sequence[Path]) -> PairingResult:
@@ -254,15 +235,6 @@ def find_camera_file(folder: Path, root: Path) -> Path | None:
         folder = folder.parent
         places.append(folder)
     return next((place / name for place in places for name in CAMERA_NAMES if (place / name).is_file()), None)
-
-
-def match_pairs(photos: Iterable[Path], depths: Iterable[Path], camera: Path | None = None) -> PairingResult:
-    """Return the pairs among photos and depth maps by name, all of one camera; see :func:`dsr.io.pairs.match_names`."""
-    photos, depths = list(photos), list(depths)
-    matches = match_names(photos, depths)
-    used = {path for match in matches for path in match}
-    unpaired = tuple(path for path in (*photos, *depths) if path not in used)
-    return PairingResult(tuple(Pair(rgb.stem, rgb, depth, camera) for rgb, depth in matches), (), unpaired)
 
 
 def add_confidence(pairs: Sequence[Pair], given: Sequence[Path]) -> tuple[Pair, ...]:
@@ -302,15 +274,10 @@ def _match_confidence(pairs: Sequence[Pair], folder: Path) -> list[Path]:
 
 def list_pictures(folder: Path) -> list[Path]:
     """Return the pictures and maps in a folder."""
-    return [folder / name for name in sorted(_picture_names(folder), key=natural_key)]
+    return [folder / name for name in sorted(picture_names(folder), key=natural_key)]
 
 
-def has_pictures(folder: Path) -> bool:
-    """Return whether there is a picture or map in a folder."""
-    return next(_picture_names(folder), None) is not None
-
-
-def _picture_names(folder: Path) -> Iterator[str]:
+def picture_names(folder: Path) -> Iterator[str]:
     """Yield the names of the pictures and maps in a folder, which may have a million files."""
     with os.scandir(folder) as entries:  # knows files from folders without asking for each
         for entry in entries:
@@ -329,12 +296,6 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...], before: str = "") ->
     return dict(sorted((int(match[1]), path) for match, path in found if match))
 
 
-def has_name(folder: Path, first: str, last: str) -> bool:
-    """Return whether a file or folder in a folder has a name that begins and ends so."""
-    with os.scandir(folder) as entries:  # a folder may have a million
-        return any(entry.name.startswith(first) and entry.name.endswith(last) for entry in entries)
-
-
 def make_names_unique(pairs: Iterable[Pair]) -> tuple[Pair, ...]:
     """Return the pairs under names of their own: that of the folder in front where two are the same, else a number."""
     pairs = list(pairs)
@@ -350,3 +311,37 @@ def make_names_unique(pairs: Iterable[Pair]) -> tuple[Pair, ...]:
             number, own = number + 1, f"{name}_{number}"
         unique[own.casefold()] = pair if pair.name == own else replace(pair, name=own)
     return tuple(unique.values())
+
+
+class Shot(NamedTuple):
+    """A photo or a depth map of a recording: the place that messages name, where it is, and when it was taken."""
+
+    place: Path
+    source: Source
+    seconds: float
+
+
+def pair_by_time(photos: Sequence[Shot], depths: Sequence[Shot], frame: CaptureFrame, unit: float) -> PairingResult:
+    """Return the frames of a recording, named by the numbers of their photos; ``frame`` is what all have in common."""
+    with naming(frame.description):
+        partner = match_times(*([shot.seconds for shot in each] for each in (photos, depths)))
+    if not partner:
+        raise ValueError(f"{frame.description}: expected photos and depth maps within 20 ms of each other, found none")
+    pairs = []
+    for first, second in partner:
+        photo, depth = photos[first], depths[second]
+        own = replace(frame, photo=photo.source, depth=depth.source)
+        pairs.append(Pair(f"{first:06}", photo.place, depth.place, unit=unit, capture=own, time=photo.seconds))
+    used = [{place for place, _ in partner}, {place for _, place in partner}]
+    lone = [shot.place for shots, known in zip((photos, depths), used, strict=True)
+            for place, shot in enumerate(shots) if place not in known]  # fmt: skip
+    return PairingResult(tuple(pairs), (), tuple(lone))
+
+
+def join(parts: Mapping[str, PairingResult]) -> PairingResult:
+    """Return the frames of several recordings, whose names begin with that of the recording, and each note once."""
+    pairs: list[Pair] = []
+    for stem, part in parts.items():
+        pairs += (replace(pair, name=stem if pair.name == stem else f"{stem}/{pair.name}") for pair in part.pairs)
+    notes = dict.fromkeys(note for part in parts.values() for note in part.assumptions)
+    return PairingResult(tuple(pairs), tuple(notes), tuple(path for part in parts.values() for path in part.unpaired))

@@ -12,8 +12,7 @@ from dsr.geometry import RangeType
 from dsr.utils.options import Options, Rule, group, option, positive
 
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "sunrgbd": 1e-3}
-SUNRGBD_BITS = 3
-"""How far SUN RGB-D turns the bits of its values to the left (``read3dPoints.m`` of its toolbox)."""
+SUNRGBD_BITS = 3  # how far SUN RGB-D turns the bits of its values to the left (read3dPoints.m of its toolbox)
 _LARGEST_UNIT = 1e6
 
 
@@ -22,12 +21,7 @@ class CameraChoice(Options):
     """Options of the photo's camera: at most one of the three; intrinsics are in the photo's pixels."""
 
     file: Path | None = option(
-        None,
-        "camera.json, Open3D's JSON, or a 3 x 3 matrix",
-        "FILE",
-        flags="--camera",
-        alone="camera",
-        recorded=False,
+        None, "camera.json, Open3D's JSON, or a 3 x 3 matrix", "FILE", flags="--camera", alone="camera", recorded=False
     )
     fov: float | None = option(
         None,
@@ -98,12 +92,7 @@ class Reading(Options):
 
 
 def parse_unit(text: str) -> float:
-    """Return the metres per value that a text names: m, cm, mm, sunrgbd, a number, or a fraction such as 1/5000.
-
-    Raises:
-        ValueError: it is none of these.
-
-    """
+    """Return the metres per value that a text names: m, cm, mm, sunrgbd, a number, or a fraction such as 1/5000."""
     if text in _UNITS:
         return _UNITS[text]
     above, _, below = text.partition("/")
@@ -118,15 +107,9 @@ def parse_unit(text: str) -> float:
 
 @dataclass(frozen=True)
 class Shard:
-    """One of the blocks into which frames are split, in their order and as equally as possible.
+    """One of the blocks into which frames are split, in their order and as equally as possible."""
 
-    Args:
-        number: which one, from 1.
-        count: number of blocks.
-
-    """
-
-    number: int
+    number: int  # which one, from 1
     count: int
 
     def __str__(self) -> str:
@@ -138,12 +121,7 @@ class Shard:
 
 
 def parse_shard(text: str) -> Shard:
-    """Parse ``K/N``.
-
-    Raises:
-        ValueError: it is something else, or K is not from 1 to N.
-
-    """
+    """Parse ``K/N`` with K from 1 to N."""
     match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text, re.ASCII)
     if match is None or not 1 <= int(match[1]) <= int(match[2]):
         raise ValueError(f"expected K/N with K from 1 to N, such as 3/16, got {text!r:.40}")

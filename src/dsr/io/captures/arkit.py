@@ -1,50 +1,31 @@
 """Captures of ARKit's lidar: videos of ARKitScenes, and exports of Polycam and 3D Scanner App.
 
-ARKitScenes; https://github.com/apple/ARKitScenes, DATA.md and raw/README.md.
+ARKitScenes; https://github.com/apple/ARKitScenes, DATA.md and raw/README.md. ``*.pincam`` has width, height, fx, fy,
+cx, cy, of a time that may be a millisecond off; ``lowres_wide.traj`` ten times a second a time, rotation (axis times
+angle) and translation from the world to the camera, whose axes are x right, y down, z forward
+(threedod/benchmark_scripts/utils/tenFpsDataLoader.py inverts them). The world is that of a laser scan, z up
+(https://github.com/apple/ARKitScenes/issues/81).
 
-    41069021/lowres_wide/41069021_305.244.png                photo; ``wide`` (1920 x 1440) is taken where it is there
-    41069021/lowres_depth/41069021_305.244.png               16-bit millimetres, 256 x 192
-    41069021/confidence/41069021_305.244.png                 0 (low) to 2 (high)
-    41069021/lowres_wide_intrinsics/41069021_305.244.pincam  width height fx fy cx cy
-    41069021/lowres_wide.traj                                time, rotation (axis times angle), translation
-
-Rotation and translation of the trajectory lead from the world to the camera, whose axes are x right, y down, z forward
-(threedod/benchmark_scripts/utils/tenFpsDataLoader.py inverts them); the world is that of a laser scan, z up
-(https://github.com/apple/ARKitScenes/issues/81). The trajectory has ten poses a second; a frame
-takes that within 10 ms of it. Intrinsics may be a millisecond off.
-
-Polycam's raw export (developer mode); https://github.com/PolyCam/polyform describes it.
-
-    keyframes/images/TIME.jpg                 photos; the same without distortion in corrected_images/
-    keyframes/cameras/TIME.json               fx fy cx cy width height, t_00 .. t_23; optimised in corrected_cameras/
-    keyframes/depth/TIME.png                  16-bit millimetres, 256 x 192
-    keyframes/confidence/TIME.png             0 (low), 127 (medium) and 255 (high)
-
-t_ij are the rows of the pose from ARKit's camera (y up, looking along -z) to the world, y up. The corrected photos and
-cameras are taken where a frame has both.
-
-3D Scanner App's export of all data; https://github.com/laanlabs/3dScannerApp_samples has some.
-
-    frame_00000.jpg          photos, 1920 x 1440, of every few frames
-    frame_00000.json         intrinsics, 9 numbers row by row, and cameraPoseARFrame, 16, ARKit's camera to world
-    depth_00000.png          16-bit millimetres, 256 x 192; frame_00000.exr in some versions
-    conf_00000.png           0 (low) to 2 (high)
+Polycam's raw export; https://github.com/PolyCam/polyform. t_ij are the rows of the pose from ARKit's camera (y up,
+looking along -z) to the world, y up; the corrected photos and cameras are taken where a frame has both. 3D Scanner
+App's samples, https://github.com/laanlabs/3dScannerApp_samples, have intrinsics and ARKit's pose row by row.
 """
 
 from __future__ import annotations
 
 import functools
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, Field
 
-from dsr.io.captures.contract import LIDAR, Capture
+from dsr.io.captures.contract import has_name
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Size, stated
 from dsr.io.images import Pixels, read_numbers
-from dsr.io.pairs import Pair, PairingResult, has_name, numbered_files, paired
+from dsr.io.pairs import Pair, PairingResult, numbered_files, paired
 from dsr.io.trajectories import (
     USUAL_SIZE,
     check_pose,
@@ -59,11 +40,10 @@ from dsr.utils.validation import parse_model
 _ARKITSCENES, _POLYCAM, _SCANNER = "ARKitScenes", "Polycam", "3D Scanner App"
 _LARGEST_PINCAM, _LARGEST_JSON = 1 << 16, 1 << 20  # bytes of a file of a camera
 _MAX_GAP = 0.010  # seconds between a frame and its pose
-_SHIFTS = (0.0, -1e-3, 1e-3)
 _Motion = tuple[float, ...]
 
 
-def _find_arkitscenes(folder: Path) -> PairingResult | None:
+def find_arkitscenes(folder: Path) -> PairingResult | None:
     """Return the frames of a video of ARKitScenes."""
     depths = {path.stem: path for path in (folder / "lowres_depth").glob("*.png")}
     kinds = ("wide", "color", "lowres_wide")
@@ -73,17 +53,20 @@ def _find_arkitscenes(folder: Path) -> PairingResult | None:
     photos = {path.stem: path for path in sorted((folder / kind).glob("*.png"), key=natural_key)}
     trajectory = folder / "lowres_wide.traj"
     motions = _read_trajectory(trajectory)
+    times = np.array([*motions])
     both, unpaired = paired(photos, depths)
     pairs = []
     for stem in both:
-        intrinsics, motion = find_intrinsics(folder / f"{kind}_intrinsics", stem), _nearest(motions, stem)
+        intrinsics, time = find_intrinsics(folder / f"{kind}_intrinsics", stem), _time(stem)
+        gaps = np.abs(times - time)
+        motion = motions[float(times[gaps.argmin()])] if (gaps <= _MAX_GAP).any() else None
         described = (b"" if intrinsics is None else read_limited(intrinsics, _LARGEST_PINCAM)) + repr(motion).encode()
         geometry = stated(_arkitscenes_geometry, f"{trajectory}: frame {stem}", intrinsics, motion)
-        time = _time(stem) if math.isfinite(_time(stem)) else None
         frame = CaptureFrame(_ARKITSCENES, geometry, intrinsics or trajectory, described)
         path = folder / "confidence" / f"{stem}.png"
         known = ConfidenceMap(path, HIGHEST_LEVEL) if path.is_file() else None
-        pairs.append(Pair(stem, photos[stem], depths[stem], unit=1e-3, capture=frame, confidence=known, time=time))
+        pair = Pair(stem, photos[stem], depths[stem], unit=1e-3, capture=frame, confidence=known)
+        pairs.append(replace(pair, time=time) if math.isfinite(time) else pair)
     text = f"a video of {_ARKITSCENES}, photos of {kind}"
     note = describe_capture(text, "millimetres", pairs, poses=bool(motions))
     return PairingResult(tuple(pairs), (note,), unpaired)
@@ -105,19 +88,10 @@ def _time(stem: str) -> float:
     return next(iter(numbers_in([stem.rpartition("_")[2]])), math.nan)
 
 
-def _nearest(motions: dict[float, _Motion], stem: str) -> _Motion | None:
-    """Return the motion nearest in time to a frame."""
-    times = np.fromiter(motions, np.float64, len(motions))
-    gaps = np.abs(times - _time(stem))
-    if not len(gaps) or not (gaps <= _MAX_GAP).any():
-        return None
-    return motions[float(times[int(gaps.argmin())])]
-
-
 def find_intrinsics(folder: Path, stem: str) -> Path | None:
     """Return the file of a frame's intrinsics, whose time may differ by a millisecond; None where there is none."""
     video = stem.rpartition("_")[0]
-    names = [f"{stem}.pincam", *(f"{video}_{_time(stem) + shift:.3f}.pincam" for shift in _SHIFTS)]
+    names = [f"{stem}.pincam", *(f"{video}_{_time(stem) + shift:.3f}.pincam" for shift in (0.0, -1e-3, 1e-3))]
     return next((folder / name for name in names if (folder / name).is_file()), None)
 
 
@@ -165,7 +139,7 @@ class _PolycamCamera(BaseModel, strict=True):
     t_23: float
 
 
-def _find_polycam(folder: Path) -> PairingResult | None:
+def find_polycam(folder: Path) -> PairingResult | None:
     """Return the frames of a raw export, or of its folder ``keyframes``."""
     frames = folder / "keyframes" if (folder / "keyframes").is_dir() else folder
     kinds = [
@@ -210,7 +184,7 @@ class _ScannerFrame(BaseModel, strict=True):
     pose: Annotated[list[float], Field(min_length=16, max_length=16)] = Field(alias="cameraPoseARFrame")
 
 
-def _find_scanner_app(folder: Path) -> PairingResult | None:
+def find_scanner_app(folder: Path) -> PairingResult | None:
     """Return the frames of an export of all data of 3D Scanner App."""
     if not has_name(folder, "frame_", ".json"):
         return None
@@ -246,52 +220,3 @@ def _scanner_geometry(path: Path | None, size: Size) -> Geometry:
     camera = fitting_camera(str(path), (size, USUAL_SIZE), (fx, fy, cx, cy))
     pose = check_pose(str(path), np.reshape(stored.pose, (4, 4)), opengl=True)
     return Geometry(camera, pose, up="y")
-
-
-ARKITSCENES = Capture(
-    _ARKITSCENES,
-    "`raw` or `3dod` of the data set",
-    "`lowres_depth/` with `wide/`, `color/` or `lowres_wide/`",
-    "depth in mm (16-bit PNG); intrinsics (`*.pincam`); poses by time; confidence 0 to 2",
-    "written by its format",
-    LIDAR,
-    "https://github.com/apple/ARKitScenes/blob/main/DATA.md",
-    _find_arkitscenes,
-    marks=("lowres_depth/*", "lowres_wide.traj"),
-    needs={
-        "lowres_depth/": ("lowres_depth/*.png",),
-        "wide/, color/ or lowres_wide/": ("wide/*.png", "color/*.png", "lowres_wide/*.png"),
-    },
-)
-POLYCAM = Capture(
-    _POLYCAM,
-    "raw data of a scan in developer mode",
-    "`keyframes/` with `cameras/*.json`",
-    "depth in mm (16-bit PNG); corrected photos, else all; intrinsics and pose of each frame; confidence",
-    "written by its format",
-    LIDAR,
-    "https://github.com/PolyCam/polyform#polycams-data-format",
-    _find_polycam,
-    marks=("keyframes/*",),
-    needs={
-        "keyframes/images/": ("keyframes/images/*.jpg", "keyframes/corrected_images/*.jpg"),
-        "keyframes/cameras/*.json": ("keyframes/cameras/*.json", "keyframes/corrected_cameras/*.json"),
-        "keyframes/depth/": ("keyframes/depth/*.png",),
-    },
-)
-SCANNER_APP = Capture(
-    _SCANNER,
-    "share the scan as All data, a folder or ZIP file",
-    "`frame_*.json` with `cameraPoseARFrame`, `frame_*.jpg`, `depth_*.png`",
-    "depth in mm (16-bit PNG; EXR); intrinsics and pose of each frame; confidence 0 to 2",
-    "two real scans, of 24 and 146 photos",
-    LIDAR,
-    "https://github.com/laanlabs/3dScannerApp_samples",
-    _find_scanner_app,
-    marks=("conf_00000.png", "frame_*.json"),
-    needs={
-        "frame_*.jpg": ("frame_*.jpg",),
-        "frame_*.json": ("frame_*.json",),
-        "depth_*.png": ("depth_*.png", "frame_*.exr"),
-    },
-)

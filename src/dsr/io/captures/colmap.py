@@ -1,4 +1,4 @@
-"""Sparse models of COLMAP: cameras, poses and lenses of photos, and their points as coarse depth.
+"""Scenes of structure from motion: sparse models of COLMAP, and ``transforms.json`` of nerfstudio and instant-ngp.
 
 https://colmap.github.io/format.html; src/colmap/scene/reconstruction_io_binary.cc and src/colmap/sensor/models.h of
 https://github.com/colmap/colmap. Numbers are little-endian:
@@ -7,12 +7,13 @@ https://github.com/colmap/colmap. Numbers are little-endian:
     images.bin     count u8; image u4, quaternion w x y z and translation f8, camera u4, name and 0, count u8 of
                    observations: x, y f8, point u8 (2^64 - 1 for none)
     points3D.bin   count u8; point u8, x, y, z f8, colour 3 u1, error f8, count u8 of observations: u4, u4
-    *.txt          the same in lines: cameras with the model's name; images in two lines, of which the second has the
-                   observations and may be empty
+    *.txt          the same in lines; of an image's two the second has the observations and may be empty
 
-Poses lead from the world to the camera, whose axes are x right, y down, z forward; the centre of the first pixel is at
-0.5. The unit of a model is whatever it was made with; it is taken for the metre. A photo is that of an image whose name
-ends its path, else of the only one of its stem.
+Poses lead from the world to the camera (x right, y down, z forward); the centre of the first pixel is at 0.5. A photo
+is that of an image whose name ends its path, else of the only one of its stem. The unit of both is taken for the metre.
+
+https://docs.nerf.studio/quickstart/data_conventions.html: intrinsics and lens coefficients of all frames or each, with
+the first pixel's corner at (0, 0), and poses of OpenGL's camera.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import io
 import math
 import struct
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,12 +33,23 @@ import numpy as np
 
 from dsr.geometry.camera import Lens
 from dsr.geometry.poses import from_quaternion, invert
-from dsr.io.captures.contract import Capture
 from dsr.io.frames import CaptureFrame, Geometry, Record, Size, Source, file_state, stated
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult
-from dsr.io.trajectories import intrinsics_camera
+from dsr.io.trajectories import check_pose, intrinsics_camera
 from dsr.notes import Assumption
-from dsr.utils.guards import decode_text, leads_outside, naming, natural_key, numbers_in, read_limited, refusing
+from dsr.utils.guards import (
+    decode_text,
+    is_number,
+    leads_outside,
+    naming,
+    natural_key,
+    numbers_in,
+    parse_json,
+    path_within,
+    read_limited,
+    read_text,
+    refusing,
+)
 from dsr.utils.versions import hash_once
 
 _APP = "COLMAP"
@@ -87,20 +99,15 @@ class _Image(NamedTuple):
     observed: np.ndarray
 
 
-class _Sparse(NamedTuple):
-    """A sparse model: its cameras, and its images in the order of their names."""
-
-    cameras: Mapping[int, _Camera]
-    images: Sequence[_Image]
-
-
 def model_file(place: Path) -> Path | None:
     """Return the file of images of a model, given by itself or as a folder; None if there is none."""
+    files = [place]
     if place.is_dir():
-        files = (place / part / f"images{suffix}" for part in _PLACES for suffix in (".bin", ".txt"))
-        return next((each for each in files if each.is_file() and _beside(each, "cameras").is_file()), None)
-    found = place.name in ("images.bin", "images.txt") and place.is_file() and _beside(place, "cameras").is_file()
-    return place if found else None
+        files = [place / part / f"images{suffix}" for part in _PLACES for suffix in (".bin", ".txt")]
+    for file in files:
+        if file.name in ("images.bin", "images.txt") and file.is_file() and _beside(file, "cameras").is_file():
+            return file
+    return None
 
 
 def _beside(file: Path, name: str) -> Path:
@@ -113,8 +120,8 @@ def _damaged(path: Path) -> AbstractContextManager[None]:
     return refusing(f"{path}: expected a model of {_APP}, got a damaged or truncated file", struct.error)
 
 
-def _read_model(file: Path) -> _Sparse:
-    """Read a model, given its file of images, with that of cameras beside it."""
+def _read_model(file: Path) -> tuple[dict[int, _Camera], list[_Image]]:
+    """Return the cameras of a model and its images by name, given the file of images with that of cameras beside it."""
     path, binary = _beside(file, "cameras"), file.suffix == ".bin"
     with _damaged(path):
         cameras = (_cameras_of_bytes if binary else _cameras_of_text)(path, read_limited(path, _LARGEST))
@@ -123,7 +130,7 @@ def _read_model(file: Path) -> _Sparse:
     for image in images:
         if image.camera not in cameras:
             raise ValueError(f"{file}: image {image.name!r:.80}: expected a camera of the model, got {image.camera}")
-    return _Sparse(cameras, sorted(images, key=lambda image: natural_key(image.name)))
+    return cameras, sorted(images, key=lambda image: natural_key(image.name))
 
 
 def _frame(file: Path, image: _Image, camera: _Camera) -> CaptureFrame:
@@ -135,9 +142,9 @@ def _frame(file: Path, image: _Image, camera: _Camera) -> CaptureFrame:
 
 def add_model(found: PairingResult, file: Path) -> PairingResult:
     """Return pairs with the cameras and poses of a model; the same with a note if it has none of their photos."""
-    model = _read_model(file)
-    names = {image.name: image for image in model.images}
-    stems = Counter(Path(image.name).stem for image in model.images)
+    cameras, images = _read_model(file)
+    names = {image.name: image for image in images}
+    stems = Counter(Path(image.name).stem for image in images)
     lone = {Path(name).stem: image for name, image in names.items() if stems[Path(name).stem] == 1}
     pairs, count = [], 0
     for pair in found.pairs:
@@ -148,7 +155,7 @@ def add_model(found: PairingResult, file: Path) -> PairingResult:
             pairs.append(pair)
             continue
         count += 1
-        frame, own = _frame(file, image, model.cameras[image.camera]), pair.capture
+        frame, own = _frame(file, image, cameras[image.camera]), pair.capture
         if own is not None:  # which has pictures, and the depth camera
             geometry = functools.partial(_joined, frame, own)
             frame = replace(own, geometry=geometry, description=file, content=frame.content + own.content)
@@ -176,8 +183,8 @@ def find_colmap(folder: Path) -> PairingResult | None:
     file = model_file(folder)
     if file is None or not (points := _beside(file, "points3D")).is_file():
         return None
-    model, pairs, lone = _read_model(file), [], []
-    for image in model.images:
+    (cameras, images), pairs, lone = _read_model(file), [], []
+    for image in images:
         places = (folder / part for part in ("images", ".", "rgb", "color") if not leads_outside(image.name))
         photo = next((place / image.name for place in places if (place / image.name).is_file()), None)
         if photo is None or photo.suffix.lower() not in PHOTO_SUFFIXES:
@@ -185,13 +192,13 @@ def find_colmap(folder: Path) -> PairingResult | None:
         if int((image.observed[:, 2] >= 0).sum()) < _FEWEST:
             lone.append(photo)
             continue
-        camera = model.cameras[image.camera]
+        camera = cameras[image.camera]
         frame = replace(_frame(file, image, camera), depth=_SparseDepth(points, image, camera))
         pairs.append(Pair(Path(image.name).with_suffix("").as_posix(), photo, points, unit=1.0, capture=frame))
     if not pairs:
         return None
     note = Assumption(f"depth is that of the points of {points.name}, a coarse and sparse map")
-    return PairingResult(tuple(pairs), (_note(len(pairs), len(model.images), file), note), tuple(lone))
+    return PairingResult(tuple(pairs), (_note(len(pairs), len(images), file), note), tuple(lone))
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +214,14 @@ class _SparseDepth(Source):
 
     def read(self) -> np.ndarray:
         """Return the depth, (h, w) float32 in the unit of the model, NaN in holes."""
-        seen, places = self._seen()
+        numbers, places = _points(self.file, file_state(self.file, "points"))
+        seen = self.image.observed
+        if not len(numbers):
+            seen = seen[:0]
+        else:
+            found = np.searchsorted(numbers, seen[:, 2], side="right") - 1  # -1 is that of the last one
+            known = numbers[found] == seen[:, 2]
+            seen, places = seen[known], places[found[known]]
         width, height = self.camera.width, self.camera.height
         step = math.sqrt(width * height / max(len(seen), 4))
         size = max(2, round(height / step)), max(2, round(width / step))
@@ -222,15 +236,6 @@ class _SparseDepth(Source):
         row, column = (rows[order] * size[0] / height).astype(int), (columns[order] * size[1] / width).astype(int)
         depth[row, column] = z[order]
         return depth
-
-    def _seen(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the observations of the points that the model has, (n, 3), and the places of these, (n, 3)."""
-        numbers, places = _points(self.file, file_state(self.file, "points"))
-        if not len(numbers):
-            return self.image.observed[:0], places
-        found = np.searchsorted(numbers, self.image.observed[:, 2], side="right") - 1  # -1 is that of the last one
-        known = numbers[found] == self.image.observed[:, 2]
-        return self.image.observed[known], places[found[known]]
 
     def record(self) -> Record:
         """Return a hash of the file of points, and the image's name."""
@@ -379,12 +384,52 @@ def _points(path: Path, _state: tuple[int, int]) -> tuple[np.ndarray, np.ndarray
     return points["number"][order].astype(np.float64), points["place"][order]
 
 
-COLMAP = Capture(
-    _APP,
-    "a sparse model, in the folder of photos and depth maps, or of photos alone; or `--poses MODEL`",
-    "`sparse/0/`, `sparse/`, `colmap/sparse/0/` with `images.bin` or `images.txt`, or these beside the photos",
-    "intrinsics; distortion; poses; depth of the maps by its values, without maps of the model's points",
-    "written by pycolmap; models of two real scenes",
-    "",
-    "https://colmap.github.io/format.html",
-)
+def add_transforms(folder: Path, found: PairingResult) -> PairingResult | None:
+    """Return pairs with cameras and poses of ``transforms.json`` in a folder or, as dsr writes it, above; else None."""
+    files = [place / "transforms.json" for place in (folder, folder.parent)]
+    file = next((path for path in files if path.is_file()), None)
+    if file is None:
+        return None
+    pairs, count = {pair.rgb: pair for pair in found.pairs}, 0
+    photos = {path.with_suffix(""): path for path in pairs}  # for names without suffixes
+    try:
+        entries = parse_json(read_text(file))
+        unit = entries.get("depth_unit_scale_factor")
+        for view in entries["frames"]:
+            photo = path_within(file.parent, view["file_path"], file)
+            photo = photos.get(photo, photo)
+            depth = path_within(file.parent, view["depth_file_path"], file) if view.get("depth_file_path") else None
+            depth = depth if depth and depth.is_file() else None
+            pair = pairs.get(photo) or (Pair(photo.stem, photo, depth) if depth and file.parent == folder else None)
+            if pair is None:
+                continue
+            own_entries = {**entries, **view, "frames": ()}
+            geometry = functools.partial(_transform, f"{file}: {view['file_path']}", own_entries)
+            frame = CaptureFrame("nerfstudio", geometry, file, repr(own_entries).encode())
+            own = unit if is_number(unit) and unit > 0 else pair.unit
+            pairs[photo], count = replace(pair, depth=depth or pair.depth, unit=own, capture=frame), count + 1
+    except (ValueError, TypeError, KeyError, AttributeError):  # of another program
+        return None
+    if not count:
+        return None
+    text = "cameras and poses: transforms.json; its unit is assumed to be the metre"
+    note = Assumption(text, f"{count} of {len(pairs)} photos")
+    return replace(found, pairs=tuple(pairs.values()), assumptions=(*found.assumptions, note))
+
+
+def _transform(place: str, view: dict[str, Any], size: tuple[int, int]) -> Geometry:
+    """Return camera, lens and pose of a frame, of which the entries may be anything."""
+    expected = f"{place}: expected numbers of a camera and a pose of 4 x 4"
+    with refusing(expected, ValueError, TypeError, KeyError, ArithmeticError):
+        width, height = int(view.get("w", size[1])), int(view.get("h", size[0]))
+        fx = view["fl_x"] if "fl_x" in view else width / 2 / math.tan(view.get("camera_angle_x", 0) / 2 or math.nan)
+        centre = view.get("cx", width / 2) - 0.5, view.get("cy", height / 2) - 0.5
+        intrinsics = (fx, view.get("fl_y", fx), *centre)
+        camera = None if math.isnan(fx) else intrinsics_camera(place, (height, width), intrinsics)
+        fisheye = "FISHEYE" in str(view.get("camera_model")) or bool(view.get("is_fisheye"))
+        names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+        lens = Lens("kannala_brandt" if fisheye else "brown_conrady", tuple(float(view.get(name, 0)) for name in names))
+        matrix = np.array(view["transform_matrix"], np.float64) if "transform_matrix" in view else None
+        if matrix is not None and matrix.shape != (4, 4):
+            raise TypeError
+    return Geometry(camera, None if matrix is None else check_pose(place, matrix, opengl=True), lens=lens)

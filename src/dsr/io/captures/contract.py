@@ -1,19 +1,17 @@
-"""What a reader of captures provides: one :class:`Capture`, which :mod:`dsr.io.captures.registry` lists."""
+"""What a reader of captures provides: one :class:`Capture`, which :mod:`dsr.io.captures` lists."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
-from dsr.io.frames import CaptureFrame, Source
-from dsr.io.pairs import Pair, PairingResult, has_name, match_times
-from dsr.utils.guards import naming, natural_key
+from dsr.utils.guards import natural_key
 
-LIDAR = "bent edges, nothing thin"
-KINECT1 = "stairs far away, smeared edges, shadows beside near things"
-STEREO = "blobs, guesses on blank walls, wrong depth on glass"
+if TYPE_CHECKING:
+    from dsr.io.pairs import PairingResult
 
 
 @dataclass(frozen=True)
@@ -34,8 +32,8 @@ class Capture:
         is_ours: whether a file in a folder is such a capture, not another one of its suffix.
         marks: patterns of paths below its folder, any of which distinguishes it from others; ``*`` in the last part
             stands for anything. Empty for single files, and for layouts without characteristic names.
-        needs: names of its parts, each with patterns of which one has to match; those that do not are named to the user
-            of a folder that has a mark.
+        needs: patterns of its parts, alternatives as ``A or B``; those that match nothing are named to the user of a
+            folder that has a mark.
 
     """
 
@@ -51,7 +49,7 @@ class Capture:
     suffixes: tuple[str, ...] = ()
     is_ours: Callable[[Path], bool] = lambda _: True
     marks: tuple[str, ...] = ()
-    needs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    needs: tuple[str, ...] = ()
 
     def frames(self, place: Path) -> PairingResult | None:
         """Return the frames of a file, of a folder, or of the files in a folder; None if it is another capture."""
@@ -63,13 +61,17 @@ class Capture:
             return found
         files = [path for path in place.iterdir() if path.suffix.lower() in self.suffixes and path.is_file()]
         files = sorted(filter(self.is_ours, files), key=natural_key)
-        return join({path.stem: of_file(path) for path in files}) if files else None
+        if not files:
+            return None
+        from dsr.io.pairs import join  # noqa: PLC0415 - torch takes seconds to import, and the table needs none
+
+        return join({path.stem: of_file(path) for path in files})
 
     def lacks(self, folder: Path) -> list[str]:
         """Return the missing parts of a folder that looks like this capture; nothing if it does not."""
         if not _has(folder, self.marks):
             return []
-        return [name for name, patterns in self.needs.items() if not _has(folder, patterns)]
+        return [part for part in self.needs if not _has(folder, part.split(" or "))]
 
     def rows(self) -> dict[str, str]:
         """Return the description, text by label, the name first; empty texts are left out."""
@@ -81,38 +83,10 @@ class Capture:
         return "\n".join(f"  {label:9}{text}" if label else text for label, text in self.rows().items())
 
 
-class Shot(NamedTuple):
-    """A photo or a depth map of a recording: the place that messages name, where it is, and when it was taken."""
-
-    place: Path
-    source: Source
-    seconds: float
-
-
-def pair_by_time(photos: Sequence[Shot], depths: Sequence[Shot], frame: CaptureFrame, unit: float) -> PairingResult:
-    """Return the frames of a recording, named by the numbers of their photos; ``frame`` is what all have in common."""
-    with naming(frame.description):
-        partner = match_times(*([shot.seconds for shot in each] for each in (photos, depths)))
-    if not partner:
-        raise ValueError(f"{frame.description}: expected photos and depth maps within 20 ms of each other, found none")
-    pairs = []
-    for first, second in partner:
-        photo, depth = photos[first], depths[second]
-        own = replace(frame, photo=photo.source, depth=depth.source)
-        pairs.append(Pair(f"{first:06}", photo.place, depth.place, unit=unit, capture=own, time=photo.seconds))
-    used = [{place for place, _ in partner}, {place for _, place in partner}]
-    lone = [shot.place for shots, known in zip((photos, depths), used, strict=True)
-            for place, shot in enumerate(shots) if place not in known]  # fmt: skip
-    return PairingResult(tuple(pairs), (), tuple(lone))
-
-
-def join(parts: Mapping[str, PairingResult]) -> PairingResult:
-    """Return the frames of several recordings, whose names begin with that of the recording, and each note once."""
-    pairs: list[Pair] = []
-    for stem, part in parts.items():
-        pairs += (replace(pair, name=stem if pair.name == stem else f"{stem}/{pair.name}") for pair in part.pairs)
-    notes = dict.fromkeys(note for part in parts.values() for note in part.assumptions)
-    return PairingResult(tuple(pairs), tuple(notes), tuple(path for part in parts.values() for path in part.unpaired))
+def has_name(folder: Path, first: str, last: str) -> bool:
+    """Return whether a file or folder in a folder has a name that begins and ends so."""
+    with os.scandir(folder) as entries:  # a folder may have a million
+        return any(entry.name.startswith(first) and entry.name.endswith(last) for entry in entries)
 
 
 def _has(folder: Path, patterns: Iterable[str]) -> bool:

@@ -1,88 +1,70 @@
-"""Data sets of depth cameras in their own folders: 7-Scenes, ScanNet's exports, SUN RGB-D, and Replica as renderings.
+"""Pictures with cameras and poses in text beside them: 7-Scenes, SUN RGB-D, Replica as renderings, and ZED's exports.
 
-7-Scenes, as its page describes it (microsoft.com, RGB-D Dataset 7-Scenes); 3DMatch has the same names, and a camera.
+7-Scenes (microsoft.com, RGB-D Dataset 7-Scenes); 3DMatch has the same names, and a camera. The cameras of 7-Scenes,
+Kinects v1, are not calibrated; its page names 585 pixels and the centre 320, 240. SUN RGB-D turns millimetres to the
+left by three bits (``read3dPoints.m`` of its toolbox); ``depth_bfx/`` has the same, filled.
 
-    frame-000000.color.png, frame-000000.depth.png    640 x 480; 16-bit millimetres, 65535 in holes; photos as JPEG in
-                                                      copies, as of https://github.com/andyzeng/tsdf-fusion-python
-    frame-000000.pose.txt                             4 x 4, from camera to world; with commas in vReLoc
-                                                      (https://github.com/loveoxford/vReLoc)
-    camera-intrinsics.txt                             3DMatch: 3 x 3, here or one folder up
+Replica as NICE-SLAM renders it; https://github.com/cvg/nice-slam, src/utils/datasets.py and configs/Replica. Line n of
+``traj.txt`` is the pose of the n-th photo if there are as many lines as photos, else of the photo numbered n from 0.
 
-The cameras of 7-Scenes, Kinects v1, are not calibrated; its page names 585 pixels and the centre 320, 240.
-
-ScanNet's exports; https://github.com/ScanNet/ScanNet, SensReader/python/SensorData.py.
-
-    color/0.jpg, depth/0.png                          1296 x 968, often made smaller; 16-bit millimetres, registered
-    pose/0.txt                                        4 x 4, from camera to world; -inf where the frame has none
-    intrinsic/intrinsic_color.txt, intrinsic_depth.txt    4 x 4
-
-SUN RGB-D; ``read3dPoints.m`` of its toolbox.
-
-    image/0000144.jpg, depth/0000144.png              16-bit millimetres, turned to the left by three bits
-    depth_bfx/0000144.png                             the same, filled; taken where depth/ has none
-    intrinsics.txt, extrinsics/*.txt                  3 x 3; the tilt, which is no pose and not read
-
-Replica as NICE-SLAM renders it; https://github.com/cvg/nice-slam, src/utils/datasets.py and configs/Replica.
-
-    results/frame000000.jpg, results/depth000000.png  1200 x 680; 1/6553.5 m
-    traj.txt                                          a pose of 4 x 4, from camera to world, in each line
-    cam_params.json                                   here or one folder up: camera with w, h, fx, fy, cx, cy, scale
-
-Line n is the pose of the n-th photo if there are as many lines as photos, else of the photo with the number n from 0.
-Cameras have the axes x right, y down, z forward in all of them.
+ZED SDK's sample *SVO Export*; https://github.com/stereolabs/zed-sdk, recording/export/svo (mode LEFT + DEPTH_16Bit),
+and https://github.com/stereolabs/zed-open-capture, examples/include/calibration.hpp. ``SN*.conf`` has both cameras
+before they are rectified, for each resolution; Baseline, TY and TZ in mm, the latter for each resolution, for all, or
+not at all, which is 0; RX, CV and RZ, a rotation vector. OpenCV's ``stereoRectify`` makes the rectified camera of them;
+the SDK, which may calibrate anew when it opens a camera, has another one within about a percent.
 """
 
 from __future__ import annotations
 
+import configparser
+import contextlib
 import functools
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import as_rigid
 from dsr.io.cameras import read_camera
-from dsr.io.captures.contract import KINECT1, Capture
-from dsr.io.captures.scannet import read_sens
+from dsr.io.captures.contract import has_name
+from dsr.io.captures.scannet import with_pose
 from dsr.io.frames import CaptureFrame, Geometry, Size
-from dsr.io.images import read_numbers
 from dsr.io.pairs import (
     PHOTO_SUFFIXES,
     Pair,
     PairingResult,
     find_camera_file,
-    has_name,
-    has_pictures,
     list_pictures,
     match_pairs,
     numbered_files,
     paired,
+    picture_names,
 )
 from dsr.io.photos import same_aspect
 from dsr.io.reading import SUNRGBD_BITS
-from dsr.io.trajectories import NO_POSE, describe_capture, fitting_camera, read_poses
+from dsr.io.trajectories import NO_POSE, describe_capture, intrinsics_camera, read_poses
 from dsr.io.units import TURNED_BACK
 from dsr.notes import Assumption
-from dsr.utils.guards import natural_key, read_limited
+from dsr.utils.guards import MOST_TEXT, natural_key, numbers_in, read_limited, read_text, refusing
 
-_LARGEST_TEXT = 1 << 16  # bytes of a file of a matrix
 _KINECT = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
 _NICE_SLAM, _REPLICA_UNIT = Camera(1200, 680, 600.0, 600.0, 599.5, 339.5), 1 / 6553.5
-_SCANNET_SIZE = (968, 1296)
 _PARAMS = ("cam_params.json", "camera.json")
-# Returns the camera of a photo of (height, width), and what was assumed for it.
-_CameraOf = Callable[[Size], tuple[Camera | None, str]]
+_ZED_SIZES = {
+    (1242, 2208): "2K", (1200, 1920): "FHD1200", (1080, 1920): "FHD", (720, 1280): "HD", (600, 960): "SVGA",
+    (376, 672): "VGA",
+}  # fmt: skip
+_ZED_CAMERA = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 
 
-def _find_seven_scenes(folder: Path) -> PairingResult | None:
+def find_seven_scenes(folder: Path) -> PairingResult | None:
     """Return the frames of a sequence of 7-Scenes or 3DMatch."""
     if not has_name(folder, "", ".pose.txt"):
         return None
-    poses, photos, depths = (
+    photos, depths = (
         {path.name.removesuffix(end): path for end in ends for path in folder.glob(f"*{end}")}
-        for ends in ((".pose.txt",), (".color.jpg", ".color.png"), (".depth.png",))
+        for ends in ((".color.jpg", ".color.png"), (".depth.png",))
     )
     both, unpaired = paired({name: photos[name] for name in sorted(photos, key=natural_key)}, depths)
     if not both:
@@ -90,35 +72,26 @@ def _find_seven_scenes(folder: Path) -> PairingResult | None:
     camera = find_camera_file(folder, folder.parent)
     pairs = []
     for name in both:
-        frame = _frame("7-Scenes", poses.get(name), folder / f"{name}.pose.txt", None if camera else _kinect)
+        path = folder / f"{name}.pose.txt"
+        content = read_limited(path, MOST_TEXT) if path.is_file() else b""
+        frame = CaptureFrame("7-Scenes", functools.partial(_seven_scenes, path, camera), path, content)
         pairs.append(Pair(name, photos[name], depths[name], camera, unit=1e-3, capture=frame))
     text = "a sequence of 7-Scenes or 3DMatch: depth in millimetres; from the folder: poses"
     return PairingResult(tuple(pairs), (Assumption(text),), unpaired)
 
 
-def _find_scannet(folder: Path) -> PairingResult | None:
-    """Return the frames of a folder of ScanNet's exports."""
-    matrices = [folder / "intrinsic" / f"intrinsic_{kind}.txt" for kind in ("color", "depth")]
-    matrices = [path for path in matrices if path.is_file()]
-    photos, depths = numbered_files(folder / "color", PHOTO_SUFFIXES), numbered_files(folder / "depth", (".png",))
-    both, unpaired = paired(photos, depths)
-    if not matrices or not both:
-        return None
-    camera = functools.partial(_scannet_camera, matrices)
-    described = b"".join(read_limited(path, _LARGEST_TEXT) for path in matrices)
-    pairs = []
-    for number in both:
-        path = folder / "pose" / f"{photos[number].stem}.txt"
-        frame = _frame("ScanNet", path if path.is_file() else None, path, camera, described)
-        pairs.append(Pair(photos[number].stem, photos[number], depths[number], unit=1e-3, capture=frame))
-    note = describe_capture("an export of ScanNet", "millimetres", pairs, poses=(folder / "pose").is_dir())
-    return PairingResult(tuple(pairs), (note,), unpaired)
+def _seven_scenes(path: Path, camera: Path | None, size: Size) -> Geometry:
+    """Return the pose of a frame, and the camera that 7-Scenes names for photos of its aspect without a camera file."""
+    if camera is not None or not same_aspect(size, (_KINECT.height, _KINECT.width)):
+        return with_pose(None, path)
+    text = "camera: 585 pixels and the centre 320, 240 assumed, which 7-Scenes names; its Kinects are not calibrated"
+    return with_pose(_KINECT, path, (Assumption(f"{text} (--intrinsics)"),))
 
 
-def _find_sunrgbd(folder: Path) -> PairingResult | None:
+def find_sunrgbd(folder: Path) -> PairingResult | None:
     """Return the pair of a scene of SUN RGB-D."""
     matrix, kinds = folder / "intrinsics.txt", [folder / kind for kind in ("depth", "depth_bfx")]
-    kinds = [path for path in kinds if path.is_dir() and has_pictures(path)]
+    kinds = [path for path in kinds if path.is_dir() and any(picture_names(path))]
     ours = matrix.is_file() and any((folder / name).is_dir() for name in ("depth_bfx", "extrinsics"))
     if not ours or not kinds or not (folder / "image").is_dir():
         return None
@@ -128,7 +101,7 @@ def _find_sunrgbd(folder: Path) -> PairingResult | None:
     return PairingResult(pairs, (Assumption(text),), found.unpaired) if pairs else None
 
 
-def _find_replica(folder: Path) -> PairingResult | None:
+def find_replica(folder: Path) -> PairingResult | None:
     """Return the frames of a scene of Replica as NICE-SLAM renders it."""
     photos = numbered_files(folder / "results", PHOTO_SUFFIXES, "frame")
     depths = numbered_files(folder / "results", (".png",), "depth")
@@ -137,68 +110,26 @@ def _find_replica(folder: Path) -> PairingResult | None:
     params = next((path for path in places if path.is_file()), None)
     if not both or not (params or trajectory.is_file()):
         return None
-    unit = (None if params is None else _unit(params)) or _REPLICA_UNIT  # also where the camera is given by other means
+    unit = None
+    if params is not None:
+        with contextlib.suppress(ValueError):  # which is reported where its camera is needed
+            unit = read_camera(params).depth_unit
     poses = read_poses(trajectory).poses if trajectory.is_file() else ()
     in_order = len(poses) == len(photos)
-    ranks = {number: rank if in_order else number for rank, number in enumerate(photos)}
     pairs = []
-    for number in both:
-        pose = poses[ranks[number]] if ranks[number] < len(poses) else None
+    for rank, number in enumerate(photos):
+        if number not in depths:
+            continue
+        place = rank if in_order else number
+        pose = poses[place] if place < len(poses) else None
         known = Geometry(None, pose, (NO_POSE,) if pose is None else ())
-        described = repr(None if pose is None else pose.tolist()).encode()
-        frame = CaptureFrame("Replica", known if params else functools.partial(_replica, known), trajectory, described)
-        pairs.append(Pair(photos[number].stem, photos[number], depths[number], params, unit=unit, capture=frame))
+        content = repr(None if pose is None else pose.tolist()).encode()
+        frame = CaptureFrame("Replica", known if params else functools.partial(_replica, known), trajectory, content)
+        files = photos[number], depths[number]
+        pairs.append(Pair(photos[number].stem, *files, params, unit=unit or _REPLICA_UNIT, capture=frame))
     text = "a scene of Replica as NICE-SLAM renders it" + ("" if params else ": depth in 1/6553.5 m (--depth-unit)")
     note = Assumption(text + ("; from the folder: poses" if poses else ""))
     return PairingResult(tuple(pairs), (note,), unpaired)
-
-
-def _frame(
-    app: str, path: Path | None, expected: Path, camera: _CameraOf | None, described: bytes = b""
-) -> CaptureFrame:
-    """Return a frame with the pose from a file and the function that gives its camera, if there are any."""
-    content = b"" if path is None else read_limited(path, _LARGEST_TEXT)
-    return CaptureFrame(app, functools.partial(_geometry, path, camera), expected, described + content)
-
-
-def _geometry(path: Path | None, camera: _CameraOf | None, size: Size) -> Geometry:
-    """Return camera and pose of a frame."""
-    found, text = (None, "") if camera is None else camera(size)
-    notes = (Assumption(text),) if text else ()
-    matrix = np.full((4, 4), np.nan) if path is None else read_numbers(path, 16).reshape(4, 4)
-    if not np.isfinite(matrix).all():
-        return Geometry(found, None, (*notes, NO_POSE))
-    return Geometry(found, as_rigid(matrix, str(path)), notes)
-
-
-def _kinect(size: Size) -> tuple[Camera | None, str]:
-    """Return the camera that 7-Scenes names, for photos of its aspect."""
-    if not same_aspect(size, (_KINECT.height, _KINECT.width)):
-        return None, ""
-    text = "camera: 585 pixels and the centre 320, 240 assumed, which 7-Scenes names; its Kinects are not calibrated"
-    return _KINECT, f"{text} (--intrinsics)"
-
-
-def _scannet_camera(paths: list[Path], size: Size) -> tuple[Camera, str]:
-    """Return the camera of the first matrix that fits the photo, else of ScanNet's photos as they are recorded."""
-    numbers = {}
-    for path in paths:
-        matrix = read_numbers(path, 16).reshape(4, 4)
-        numbers[path] = [float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2))]
-    for path, each in numbers.items():
-        try:
-            return fitting_camera(str(path), (size,), each), ""
-        except ValueError:  # it is of other pixels
-            continue
-    return fitting_camera(str(paths[0]), (size, _SCANNET_SIZE), numbers[paths[0]]), ""
-
-
-def _unit(params: Path) -> float | None:
-    """Return metres per value by a camera file; None if it does not say."""
-    try:
-        return read_camera(params).depth_unit
-    except ValueError:  # is said where its camera is needed
-        return None
 
 
 def _replica(found: Geometry, size: Size) -> Geometry:
@@ -209,60 +140,52 @@ def _replica(found: Geometry, size: Size) -> Geometry:
     return found._replace(camera=_NICE_SLAM, assumptions=(Assumption(text), *found.assumptions))
 
 
-SEVEN_SCENES = Capture(
-    "7-Scenes or 3DMatch",
-    "a sequence",
-    "`*.color.png` or `.jpg`, `*.depth.png`, `*.pose.txt`",
-    "depth in mm (16-bit PNG), 65535 in holes; `camera-intrinsics.txt`, else those of its page; poses",
-    "a real sequence of 1000 frames",
-    KINECT1,
-    "https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/",
-    _find_seven_scenes,
-    marks=("*.pose.txt",),
-    needs={"*.color.png": ("*.color.png", "*.color.jpg"), "*.depth.png": ("*.depth.png",)},
-)
-SCANNET = Capture(
-    "ScanNet",
-    "the `.sens` recording, or its export with SensReader",
-    "`*.sens`; `intrinsic/intrinsic_color.txt` with `color/` and `depth/`",
-    "depth in mm (zlib, raw, 16-bit PNG); intrinsics; poses, none where tracking was lost",
-    "written by its format",
-    KINECT1,
-    "https://github.com/ScanNet/ScanNet/blob/master/SensReader/python/SensorData.py",
-    _find_scannet,
-    read_sens,
-    (".sens",),
-    marks=("intrinsic/intrinsic_*.txt", "pose/*.txt"),
-    needs={
-        "color/": ("color/*",),
-        "depth/": ("depth/*.png",),
-        "intrinsic/intrinsic_color.txt": ("intrinsic/intrinsic_*.txt",),
-    },
-)
-SUNRGBD = Capture(
-    "SUN RGB-D",
-    "a scene in its own folders",
-    "`image/`, `depth/`, `intrinsics.txt`, and `depth_bfx/` or `extrinsics/`",
-    "depth in mm with turned bits; intrinsics",
-    "real frames of two sensors",
-    "Kinects, Xtion and RealSense",
-    "https://rgbd.cs.princeton.edu/",
-    _find_sunrgbd,
-    marks=("depth_bfx/*",),
-    needs={"image/": ("image/*",), "intrinsics.txt": ("intrinsics.txt",)},
-)
-REPLICA = Capture(
-    "Replica of NICE-SLAM",
-    "a rendered scene, or another program's in the same layout",
-    "`results/frame*.jpg`, `results/depth*.png`, and `traj.txt` or `cam_params.json`",
-    "depth in 1/`scale` m (1/6553.5); intrinsics (`cam_params.json`, here or one folder up); poses",
-    "written by its format",
-    "",
-    "https://github.com/cvg/nice-slam/blob/master/src/utils/datasets.py",
-    _find_replica,
-    marks=("results/depth*.png",),
-    needs={
-        "results/frame*.jpg": ("results/frame*",),
-        "traj.txt or cam_params.json": ("traj.txt", "cam_params.json"),
-    },
-)
+def find_zed(folder: Path) -> PairingResult | None:
+    """Return the frames of a folder of exported pictures with a calibration."""
+    calibrations = sorted(path for path in folder.glob("SN*.conf") if path.is_file())
+    photos, depths = (numbered_files(folder, (".png",), kind) for kind in ("left", "depth"))
+    both, unpaired = paired(photos, depths)
+    if not calibrations or not both:
+        return None
+    if len(calibrations) > 1:
+        raise ValueError(f"{folder}: expected one calibration of ZED, got {', '.join(p.name for p in calibrations)}")
+    path, text = calibrations[0], read_text(calibrations[0])
+    frame = CaptureFrame("ZED", functools.partial(_zed, path, text), path, text.encode())
+    pairs = tuple(
+        Pair(photos[number].stem.removeprefix("left"), photos[number], depths[number], unit=1e-3, capture=frame)
+        for number in both
+    )
+    note = describe_capture("pictures of ZED", "millimetres", pairs, poses=False)
+    return PairingResult(pairs, (note,), unpaired)
+
+
+def _zed(path: Path, text: str, size: Size) -> Geometry:
+    """Return the camera of the rectified photo of (height, width)."""
+    if size not in _ZED_SIZES:
+        sizes = ", ".join(f"{width} x {height}" for height, width in _ZED_SIZES)
+        return Geometry(None, None, (Assumption(f"{path.name} is not used: it is of photos of {sizes}"),))
+    resolution = _ZED_SIZES[size]
+    parser = configparser.ConfigParser(strict=False, interpolation=None)
+    with refusing(f"{path}: expected the calibration of ZED, got a damaged or foreign file", configparser.Error):
+        parser.read_string(text)
+    if parser.has_section("STEREO"):
+        for name in ("TY", "TZ"):
+            parser["STEREO"].setdefault(f"{name}_{resolution}", parser.get("STEREO", name, fallback="0"))
+
+    def numbers(section: str, *names: str) -> np.ndarray:
+        came = [parser.get(section, name, fallback="nothing") for name in names]
+        values = np.array(numbers_in(came))
+        if not len(values) or not np.isfinite(values).all():
+            raise ValueError(f"{path}: {section}: expected numbers for {', '.join(names)}, got {', '.join(came):.120}")
+        return values
+
+    left, right = (numbers(f"{side}_CAM_{resolution}", *_ZED_CAMERA) for side in ("LEFT", "RIGHT"))
+    between = numbers("STEREO", "Baseline", *(f"{name}_{resolution}" for name in ("TY", "TZ", "RX", "CV", "RZ")))
+    matrices = [np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) for fx, fy, cx, cy, *_ in (left, right)]
+    with refusing(f"{path}: expected the calibration of two cameras side by side, got another", cv2.error):
+        rectified = cv2.stereoRectify(
+            matrices[0], left[4:], matrices[1], right[4:], size[::-1], cv2.Rodrigues(between[3:])[0],
+            between[:3].reshape(3, 1), flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
+        )[2]  # fmt: skip
+    camera = intrinsics_camera(str(path), size, [float(rectified[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2))])
+    return Geometry(camera, None, (Assumption("camera: that of the factory calibration, which the SDK refines"),))

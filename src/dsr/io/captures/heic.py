@@ -1,15 +1,11 @@
 """Photos with a depth map in one HEIC file, as iPhones write in portrait mode, read by the package pillow-heif.
 
-The depth map is an auxiliary image of 8 bits. What they stand for is a message of HEVC (H.265, depth representation
-information), which libheif reads: https://github.com/strukturag/libheif, libheif/api/libheif/heif.h. Apple's depth is
-mostly disparity in 1/m; its calibration is XMP text of the map, of which pillow-heif has none and which is searched for
-in the file (tags of https://exiftool.org/TagNames/XMP.html#apple_pdi and AVDepthData's documentation):
-
-    depthData:Accuracy                    absolute; or relative, disparity up to an unknown scale and shift
-    depthData:IntrinsicMatrix             column by column, pixels of the reference size
-    IntrinsicMatrixReferenceWidth, -Height
-
-The photo comes turned as its properties say, mostly upright; the matrix is of the picture before that.
+What the 8 bits of the map stand for is a message of HEVC (H.265, depth representation information), which libheif
+reads: https://github.com/strukturag/libheif, libheif/api/libheif/heif.h. Apple's is mostly disparity in 1/m; its
+calibration is XMP text of the map, of which pillow-heif has none and which is searched for in the file (tags of
+https://exiftool.org/TagNames/XMP.html#apple_pdi and AVDepthData's documentation): the matrix is column by column, in
+pixels of the reference size, of the picture before it is turned as its properties say. Relative accuracy is disparity
+up to an unknown scale and shift.
 """
 
 from __future__ import annotations
@@ -22,11 +18,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from dsr.geometry.camera import Camera
-from dsr.io.captures.contract import Capture
 from dsr.io.frames import CaptureFrame, Geometry, Record, Size, Source
 from dsr.io.pairs import Pair, PairingResult
-from dsr.io.photos import HEIC_SUFFIXES, decode_heic, open_heic, read_heic, same_aspect, turned_in_heic
+from dsr.io.photos import decode_heic, open_heic, read_heic, same_aspect, turned_in_heic
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import MOST_FILE, MOST_TEXT, numbers_in, opened, read_limited
@@ -59,17 +53,21 @@ class _HeicImage(Source):
         return {"file": f"{self.file.name}/{self.role}", "sha256": file_hash(self.file)}
 
 
-def _read(path: Path) -> PairingResult:
+def read(path: Path) -> PairingResult:
     """Return the pair of a HEIC file."""
-    if not _has_depth(path):
+    if not has_depth(path):
         raise ValueError(f"{path}: expected a HEIC photo with a depth map, as of portrait mode; there is none")
-    sources, xmp = (_HeicImage(path, "photo"), _HeicImage(path, "depth")), _depth_xmp(path)
+    content = read_limited(path, MOST_FILE)
+    place = content.find(b"http://ns.apple.com/depthData/")  # in XMP text about the map, if there is some
+    first, end = content.rfind(b"<x:xmpmeta", 0, max(place, 0)), content.find(b"</x:xmpmeta>", max(place, 0))
+    xmp = content[first:end] if place >= 0 and first >= 0 and end - first <= MOST_TEXT and end >= 0 else b""
+    sources = _HeicImage(path, "photo"), _HeicImage(path, "depth")
     frame = CaptureFrame(_APP, functools.partial(_geometry, path, xmp), path, xmp, *sources)
     pair = Pair(path.stem, path, path / "depth", unit=1.0, capture=frame)
     return PairingResult((pair,), (Assumption("HEIC photos with depth maps of their own"),))
 
 
-def _has_depth(path: Path) -> bool:
+def has_depth(path: Path) -> bool:
     """Return whether a file lists a depth map."""
     with opened(path) as file:
         return _MARK.search(file.read(_HEAD)) is not None
@@ -92,14 +90,6 @@ def _read_depth(path: Path, stored: Any) -> np.ndarray:
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.nan).astype(np.float32)
 
 
-def _depth_xmp(path: Path) -> bytes:
-    """Return the XMP text about the depth map; empty if there is none."""
-    content = read_limited(path, MOST_FILE)
-    place = content.find(b"http://ns.apple.com/depthData/")
-    first, end = content.rfind(b"<x:xmpmeta", 0, max(place, 0)), content.find(b"</x:xmpmeta>", max(place, 0))
-    return content[first:end] if place >= 0 and first >= 0 and end - first <= MOST_TEXT and end >= 0 else b""
-
-
 def _geometry(path: Path, xmp: bytes, size: Size) -> Geometry:
     """Return the camera of a photo of (height, width)."""
     text = xmp.decode(errors="replace")
@@ -108,21 +98,16 @@ def _geometry(path: Path, xmp: bytes, size: Size) -> Geometry:
     if accuracy is None or accuracy[1] != "absolute":
         known = "is relative, as the file states" if accuracy else "may be relative, the file does not say"
         notes.append(Assumption(f"the depth {known}: sizes and distances mean little"))
-    camera = _camera(path, text, turned_in_heic(path), size)
-    return Geometry(camera, None, tuple(notes))
-
-
-def _camera(path: Path, text: str, orientation: int, size: Size) -> Camera | None:
-    """Return the camera in the XMP text of the depth map; None if it has none."""
     matrix = re.search(r"depthData:IntrinsicMatrix>(.*?)</depthData:IntrinsicMatrix>", text, re.DOTALL)
     sides = dict(re.findall(r"depthData:IntrinsicMatrixReference(Width|Height)\W{1,3}(\d{1,6})\b", text))
     if matrix is None or len(sides) < 2:
-        return None
+        return Geometry(None, None, tuple(notes))
     values = numbers_in(re.findall(r"<rdf:li>\s*([^<\s]*)\s*</rdf:li>", matrix[1]))
     width, height = int(sides["Width"]), int(sides["Height"])
     if len(values) != 9 or min(width, height) < 1:
         raise ValueError(f"{path}: depthData:IntrinsicMatrix: expected 9 numbers, got {matrix[1].strip()!r:.60}")
     fx, _, _, _, fy, _, cx, cy, _ = values
+    orientation = turned_in_heic(path)
     if orientation in (3, 8):  # turned by a half, or to the left; mirrored pictures are no photos of a camera
         cx = width - 1 - cx
     if orientation in (3, 6):
@@ -135,18 +120,5 @@ def _camera(path: Path, text: str, orientation: int, size: Size) -> Camera | Non
             f"{path}: depthData:IntrinsicMatrix: expected the photo's aspect, got a camera of {turned[1]} x "
             f"{turned[0]} for {size[1]} x {size[0]} pixels (width x height)"
         )
-    return intrinsics_camera(f"{path}: depthData:IntrinsicMatrix", turned, (fx, fy, cx, cy))
-
-
-HEIC = Capture(
-    "HEIC photos with depth",
-    "the unmodified `.heic`, as of iPhones in portrait mode; no JPEG of it",
-    "`*.heic`, `*.heif` with a depth map",
-    "depth in m or disparity in 1/m (8 bits), and whether it is relative; intrinsics (XMP, else EXIF); orientation",
-    "a real iPhone photo",
-    "256 steps; of two lenses or a network: guesses on blank walls, hair and glass, mostly no true distances",
-    "https://developer.apple.com/documentation/avfoundation/avdepthdata",
-    of_file=_read,
-    suffixes=HEIC_SUFFIXES,
-    is_ours=_has_depth,
-)
+    camera = intrinsics_camera(f"{path}: depthData:IntrinsicMatrix", turned, (fx, fy, cx, cy))
+    return Geometry(camera, None, tuple(notes))

@@ -1,17 +1,11 @@
 """Recordings of the Azure Kinect and of Orbbec's Femto cameras with its SDK: Matroska files, read by the package PyAV.
 
 https://github.com/microsoft/Azure-Kinect-Sensor-SDK: src/record (tracks and tags), src/calibration/calibration.c and
-src/transformation/mode_specific_calibration.c.
-
-    DEPTH, K4A_DEPTH_MODE    raw 16-bit big-endian millimetres (FOURCC b16g), 0 in holes
-    COLOR, K4A_COLOR_MODE    MJPG, NV12, YUY2 or BGRA
-    calibration.json         attachment: for each camera cx, cy, fx, fy, k1 to k6, codx, cody, p2, p1, of an image of
-                             1 x 1 whose corner is (0, 0), and the motion from the rig's frame to its own in metres
-    K4A_DEPTH_DELAY_NS       how much later than a photo its depth map was taken, on purpose
-
-Each mode of a camera sees a part of that image, scaled. The lens model is OpenCV's. That of Orbbec's wrapper of the
-SDK, Rational6KT, has half of OpenCV's mixed tangential terms and is taken for it: tenths of a pixel in the corners of a
-4K photo. Photo and depth map are paired by their times, within 20 ms.
+src/transformation/mode_specific_calibration.c. ``K4A_DEPTH_DELAY_NS`` is how much later than a photo its depth map was
+taken, on purpose. ``calibration.json`` has for each camera cx, cy, fx, fy, k1 to k6, codx, cody, p2, p1, of an image of
+1 x 1 whose corner is (0, 0), and the motion from the rig's frame to its own in metres. Each mode of a camera sees a
+part of that image, scaled. The lens model is OpenCV's. That of Orbbec's wrapper of the SDK, Rational6KT, has half of
+OpenCV's mixed tangential terms and is taken for it: tenths of a pixel in the corners of a 4K photo.
 """
 
 from __future__ import annotations
@@ -31,9 +25,8 @@ from pydantic import AliasPath, BaseModel, Field
 from dsr.geometry.camera import Camera, Lens
 from dsr.geometry.poses import as_rigid, invert
 from dsr.io.captures.archive import decode_photo
-from dsr.io.captures.contract import Capture, Shot, pair_by_time
-from dsr.io.frames import CaptureFrame, Geometry, Record, Rig, Size, Source, file_state, stated
-from dsr.io.pairs import PairingResult
+from dsr.io.frames import CaptureFrame, Geometry, Part, Record, Rig, Size, file_state, stated
+from dsr.io.pairs import PairingResult, Shot, pair_by_time
 from dsr.io.trajectories import describe_capture, intrinsics_camera
 from dsr.utils.guards import expect_pixels, numbers_in, opened, refusing
 from dsr.utils.validation import Number, Whole, parse_model
@@ -79,105 +72,87 @@ class _Calibration(BaseModel):
 
 
 @dataclass(frozen=True)
-class _Packet(Source):
-    """A frame of a recording.
+class _Packet(Part):
+    """A frame of a recording, by its track and when it was taken in the track's unit."""
 
-    Args:
-        file: the recording.
-        track: index of the track.
-        time: when it was taken, in the track's unit.
-        size: (height, width).
-        kind: ``b16g`` of depth, or the first letters of ``K4A_COLOR_MODE``.
-
-    """
-
-    file: Path
     track: int
     time: int
-    size: Size
-    kind: str
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        """What messages call it."""
-        return f"{self.kind} frame at {self.time}"
-
-    def decode(self, content: bytes) -> np.ndarray:
-        """Return (H, W, 3) uint8 RGB of a photo, (h, w) uint16 of a depth map as it is stored."""
-        height, width = self.size
-        if self.kind == "MJPG":
-            photo = decode_photo(content)
-            if photo.shape[:2] != self.size:
-                got = f"{photo.shape[1]} x {photo.shape[0]}"
-                raise ValueError(f"expected a photo of {width} x {height} pixels, got {got}")
-            return photo
-        each, code = _COLOURS.get(self.kind, (2, 0))
-        if len(content) != height * width * each:
-            raise ValueError(
-                f"expected {width} x {height} pixels of {each:g} bytes, which are {height * width * each:g}, "
-                f"got {len(content)} bytes"
-            )
-        if self.kind == _DEPTH:
-            return np.frombuffer(content, ">u2").reshape(self.size).astype(np.uint16)
-        rows = (height * 3 // 2, width, 1) if self.kind == "NV12" else (height, width, int(each))
-        return cv2.cvtColor(np.frombuffer(content, np.uint8).reshape(rows), code)
 
     def record(self) -> Record:
         """Return the recording's name, the track's and the time, and a hash of the frame."""
         return {**super().record(), "file": f"{self.file.name}/{self.track}", "frame": self.time}
 
-    def content(self) -> bytes:
-        """Return the frame as it is stored."""
-        with _LOCK, _demuxing(self.file):
-            container = _open(self.file, file_state(self.file, "a recording"))
-            track = container.streams[self.track]
-            container.seek(self.time, stream=track, any_frame=True)
-            for packet in container.demux(track):
-                if packet.pts == self.time:
-                    return bytes(packet)
-        raise ValueError(f"{self.file}: expected a frame at {self.time} in track {self.track}, there is none any more")
+
+def _fetch(path: Path, number: int, time: int) -> bytes:
+    """Return the frame of a track as it is stored."""
+    with _recording(path) as container:
+        track = container.streams[number]
+        container.seek(time, stream=track, any_frame=True)
+        for packet in container.demux(track):
+            if packet.pts == time:
+                return bytes(packet)
+    raise ValueError(f"{path}: expected a frame at {time} in track {number}, there is none any more")
 
 
-def _is_ours(path: Path) -> bool:
+def _decode(size: Size, kind: str, content: bytes) -> np.ndarray:
+    """Return (H, W, 3) uint8 RGB of a photo, (h, w) uint16 of a depth map as it is stored."""
+    height, width = size
+    if kind == "MJPG":
+        photo = decode_photo(content)
+        if photo.shape[:2] != size:
+            got = f"{photo.shape[1]} x {photo.shape[0]}"
+            raise ValueError(f"expected a photo of {width} x {height} pixels, got {got}")
+        return photo
+    each, code = _COLOURS.get(kind, (2, 0))
+    if len(content) != height * width * each:
+        raise ValueError(
+            f"expected {width} x {height} pixels of {each:g} bytes, which are {height * width * each:g}, "
+            f"got {len(content)} bytes"
+        )
+    if kind == _DEPTH:
+        return np.frombuffer(content, ">u2").reshape(size).astype(np.uint16)
+    rows = (height * 3 // 2, width, 1) if kind == "NV12" else (height, width, int(each))
+    return cv2.cvtColor(np.frombuffer(content, np.uint8).reshape(rows), code)
+
+
+def is_ours(path: Path) -> bool:
     """Return whether a file is a recording of a Kinect, not another video."""
     with opened(path) as file:
         return _MARK in file.read(_HEAD)
 
 
-def _read(path: Path) -> PairingResult:
+def read(path: Path) -> PairingResult:
     """Return the frames of a recording."""
-    with _LOCK, _demuxing(path):
-        container = _open(path, file_state(path, "a recording"))
-        photos, depths, sizes = _shots(path, container)
+    shots: dict[str, list[Shot]] = {"color": [], "depth": []}
+    with _recording(path) as container:
+        color, depth = (_track(path, container, role) for role in shots)
+        kind = color.metadata.get("K4A_COLOR_MODE", "MJPG").partition("_")[0]
+        if kind not in ("MJPG", *_COLOURS):
+            raise ValueError(f"{path}: expected photos as MJPG, {', '.join(_COLOURS)}, got {kind:.40}")
+        text = container.metadata.get("K4A_DEPTH_DELAY_NS", "0")
+        delay = numbers_in([text])
+        if not delay:
+            raise ValueError(f"{path}: K4A_DEPTH_DELAY_NS: expected a whole number, got {text:.40}")
+        about = {color.index: ("color", color, kind, 0.0), depth.index: ("depth", depth, _DEPTH, 1e-9 * delay[0])}
+        container.seek(0)
+        for packet in container.demux([color, depth]):
+            if packet.pts is not None:
+                role, track, stored, late = about[packet.stream.index]
+                fetch = functools.partial(_fetch, path, track.index, packet.pts)
+                decode = functools.partial(_decode, (track.height, track.width), stored)
+                name = f"{stored} frame at {packet.pts}"
+                source = _Packet(path, name, fetch, decode, track.index, packet.pts)
+                seconds = packet.pts * float(packet.time_base) - late
+                shots[role].append(Shot(path / role / f"{len(shots[role]):06}", source, seconds))
         attached = [bytes(each.data) for each in container.streams.attachments if each.name == "calibration.json"]
+        sizes = (color.height, color.width), (depth.height, depth.width)
     if not attached:
         raise ValueError(f"{path}: expected a recording with the attachment calibration.json, there is none")
     geometry = stated(_geometry, f"{path}: calibration.json", attached[0], *sizes)
-    found = pair_by_time(photos, depths, CaptureFrame(_APP, geometry, path, attached[0], apart=True), 1e-3)
+    frame = CaptureFrame(_APP, geometry, path, attached[0], apart=True)
+    found = pair_by_time(shots["color"], shots["depth"], frame, 1e-3)
     note = describe_capture(f"a recording of {_APP}", "millimetres", found.pairs, poses=False)
     return replace(found, assumptions=(note,))
-
-
-def _shots(path: Path, container: Any) -> tuple[list[Shot], list[Shot], tuple[Size, Size]]:
-    """Return photos and depth maps in order, with the times that both should have, and (height, width) of each."""
-    color, depth = (_track(path, container, role) for role in ("color", "depth"))
-    kind = color.metadata.get("K4A_COLOR_MODE", "MJPG").partition("_")[0]
-    if kind not in ("MJPG", *_COLOURS):
-        raise ValueError(f"{path}: expected photos as MJPG, {', '.join(_COLOURS)}, got {kind:.40}")
-    text = container.metadata.get("K4A_DEPTH_DELAY_NS", "0")
-    delay = numbers_in([text])
-    if not delay:
-        raise ValueError(f"{path}: K4A_DEPTH_DELAY_NS: expected a whole number, got {text:.40}")
-    about = {color.index: ("color", color, kind, 0.0), depth.index: ("depth", depth, _DEPTH, 1e-9 * delay[0])}
-    shots: dict[str, list[Shot]] = {"color": [], "depth": []}
-    container.seek(0)
-    for packet in container.demux([color, depth]):
-        if packet.pts is not None:
-            role, track, stored, late = about[packet.stream.index]
-            source = _Packet(path, track.index, packet.pts, (track.height, track.width), stored)
-            seconds = packet.pts * float(packet.time_base) - late
-            shots[role].append(Shot(path / role / f"{len(shots[role]):06}", source, seconds))
-    return shots["color"], shots["depth"], ((color.height, color.width), (depth.height, depth.width))
 
 
 def _track(path: Path, container: Any, role: str) -> Any:
@@ -207,9 +182,9 @@ def _geometry(place: str, content: bytes, size: Size, size_lr: Size) -> Geometry
     if photo.width * 9 == photo.height * 16:  # of old devices: the middle three quarters of the image
         numbers = [numbers[0], (numbers[1] * 0.75) + 0.125, numbers[2], numbers[3] * 0.75, *numbers[4:]]
     whole = (width * 3 // 4, width)
-    camera = _scale(place, numbers, whole, (0, (whole[0] - size[0]) / 2), size)
+    camera = _part_of(place, numbers, whole, (0, (whole[0] - size[0]) / 2), size)
     side, left, top = _DEPTH_MODES[size_lr]
-    own = _scale(place, depth.numbers, (side, side), (left, top), size_lr)
+    own = _part_of(place, depth.numbers, (side, side), (left, top), size_lr)
     motions = []  # from the rig's frame to the cameras', (4, 4), metres
     for each in (depth, photo):
         motion = np.column_stack((np.reshape(each.rotation, (3, 3)), each.translation))
@@ -218,21 +193,12 @@ def _geometry(place: str, content: bytes, size: Size, size_lr: Size) -> Geometry
     return Geometry(camera, lens=_lens(place, photo), rig=Rig(own, transform, _lens(place, depth)))
 
 
-def _scale(place: str, numbers: Sequence[float], whole: Size, cut: tuple[float, float], size: Size) -> Camera:
-    """Return the camera of a part of an image.
-
-    Args:
-        numbers: cx, cy, fx, fy of an image of 1 x 1 whose corner is (0, 0).
-        whole: (height, width) of the image.
-        cut: columns and rows that are cut off left and above.
-        size: (height, width) of the part.
-
-    """
+def _part_of(place: str, numbers: Sequence[float], whole: Size, cut: tuple[float, float], size: Size) -> Camera:
+    """Return the camera of a part of size (height, width) of a ``whole`` image, of which ``cut`` is left and above."""
     cx, cy, fx, fy = numbers[:4]
     height, width = whole
-    return intrinsics_camera(
-        place, size, (fx * width, fy * height, cx * width - cut[0] - 0.5, cy * height - cut[1] - 0.5)
-    )
+    centre = cx * width - cut[0] - 0.5, cy * height - cut[1] - 0.5
+    return intrinsics_camera(place, size, (fx * width, fy * height, *centre))
 
 
 def _lens(place: str, camera: _Camera) -> Lens:
@@ -246,12 +212,13 @@ def _lens(place: str, camera: _Camera) -> Lens:
 
 
 @contextmanager
-def _demuxing(path: Path) -> Iterator[None]:
-    """Raise a ValueError that names the recording in place of PyAV's errors."""
+def _recording(path: Path) -> Iterator[Any]:
+    """Yield the open recording to one thread; a ValueError that names it takes the place of PyAV's errors."""
     with refusing(f"{path}: recordings of {_APP} need the package av: {how_to_install('captures')}", ImportError):
         import av  # noqa: PLC0415 - an extra
-    with refusing(f"{path}: expected a recording of {_APP}, got a damaged or foreign file", av.FFmpegError):
-        yield
+    wrong = f"{path}: expected a recording of {_APP}, got a damaged or foreign file"
+    with _LOCK, refusing(wrong, av.FFmpegError):
+        yield _open(path, file_state(path, "a recording"))
 
 
 @functools.lru_cache(maxsize=1)
@@ -262,18 +229,3 @@ def _open(path: Path, _state: tuple[int, int]) -> Any:
     with opened(path) as file:
         file.read(1)  # or the error names the file, such as that of a link to a device
     return av.open(str(path), format="matroska", options={"codec_whitelist": "rawvideo", "analyzeduration": "0"})
-
-
-KINECT = Capture(
-    _APP,
-    "the `.mkv` of `k4arecorder`; of a Femto Bolt or Mega, that of Orbbec's K4A wrapper",
-    "`*.mkv` with its tracks `COLOR` and `DEPTH`",
-    "depth in mm (b16g), warped into the photo's view; photos as MJPEG, NV12, YUY2, BGRA; intrinsics, extrinsics and "
-    "distortion of both cameras (`calibration.json`), undone; time",
-    "written by its format; a real device's calibration gives its SDK's own numbers",
-    "flying pixels, noise on dark surfaces, rounded corners",
-    "https://github.com/microsoft/Azure-Kinect-Sensor-SDK/tree/develop/src/record",
-    of_file=_read,
-    suffixes=(".mkv",),
-    is_ours=_is_ours,
-)

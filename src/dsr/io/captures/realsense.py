@@ -4,15 +4,14 @@ https://github.com/IntelRealSense/librealsense, src/media/ros/ros_file_format.h 
 2.59 writes it. Topics below ``/device_0/sensor_0``, for which the sensor of the stream has its own number:
 
     .bag                                    .db3
-    /file_version                           the same                                    2 to 4
     option/Depth_Units/value (Float32)      the same (String)                           metres; version 2: ``property``
     Depth_0/image/data (Image)              ... or .../data/compressedDepth, /compressed
     Depth_0/info/camera_info (CameraInfo)   Depth_0/camera_info (String: key=value;...)
     Depth_0/tf/1 (Transform)                Depth_0/tf/ref_1 (String), column by column
     Depth_0/image/metadata                  the same, with the frame's time stamp       ms; .bag: in the image's header
 
-``Color_0`` has the same. ``tf`` leads from the frame of reference of its number to the stream's, so depth to colour is
-that of colour after the inverse of that of depth. Frames are paired by their time stamps, within 20 ms.
+``tf`` leads from the frame of reference of its number to the stream's, so depth to colour is that of colour after the
+inverse of that of depth.
 """
 
 from __future__ import annotations
@@ -27,9 +26,8 @@ import numpy as np
 from dsr.geometry.camera import Camera, Lens
 from dsr.geometry.poses import Matrix, as_rigid, from_quaternion, invert
 from dsr.io.captures.bags import deserialize, first_message, images_of, messages_of, naming_recording
-from dsr.io.captures.contract import STEREO, Capture, Shot, pair_by_time
 from dsr.io.frames import CaptureFrame, Geometry, Rig
-from dsr.io.pairs import PairingResult
+from dsr.io.pairs import PairingResult, Shot, pair_by_time
 from dsr.io.trajectories import describe_capture, intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import naming, numbers_in
@@ -196,13 +194,13 @@ def _shots(reader: Any, path: Path, topic: re.Match[str]) -> list[Shot]:
     for time, message in messages_of(reader, f"{topic['stream']}/image/metadata") if reader.is2 else ():
         stamps[time] = numbers_in([_entries(message, "").get("timestamp", "")])
     shots = []
-    for message, raw in images_of(reader, path, topic[0]):
+    for message in images_of(reader, path, topic[0]):
         if reader.is2:
             stamp = 1e-3 * (stamps.get(message.time) or [1e-6 * message.time])[0]
         else:
-            header = deserialize(reader, raw, message.kind).header.stamp
+            header = deserialize(reader, message.raw, message.kind).header.stamp
             stamp = header.sec + 1e-9 * header.nanosec
-        shots.append(Shot(Path(f"{path}{topic[0]}"), message, stamp))
+        shots.append(Shot(Path(f"{path}{topic[0]}"), message.source, stamp))
     return sorted(shots, key=lambda shot: shot.seconds)
 
 
@@ -215,14 +213,3 @@ def _device(reader: Any) -> str:
         if name:
             return str(name)
     return "RealSense"
-
-
-REALSENSE = Capture(
-    "RealSense SDK",
-    "record in RealSense Viewer, or `enable_record_to_file`, with depth and colour",
-    "`*.bag` (SDK up to 2.57), `*.db3` (since)",
-    "depth in the unit of `Depth_Units`, warped to the photo; both intrinsics, extrinsics and distortions; time",
-    "two recordings that SDK 2.55 and 2.59 wrote",
-    STEREO,
-    "https://github.com/IntelRealSense/librealsense/blob/master/src/media/ros/ros_file_format.h",
-)  # which dsr.io.captures.ros opens

@@ -17,25 +17,25 @@ from __future__ import annotations
 import functools
 import json
 import re
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, Field, ValidationError
+import numpy as np
+from pydantic import BaseModel, Field
 
-from dsr.io.captures.archive import PHOTO_LIMIT, Archive, Member, decode_lzfse, decode_photo
-from dsr.io.captures.contract import LIDAR, Capture
-from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, stated
+from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo, members, read_part
+from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Part, Size, stated
 from dsr.io.pairs import Pair, PairingResult, numbered_files, paired
 from dsr.io.trajectories import describe_capture, intrinsics_camera, pose_from_quaternion
 from dsr.notes import Assumption
-from dsr.utils.validation import Whole, describe
+from dsr.utils.guards import refusing
+from dsr.utils.validation import Whole, parse_model
+from dsr.utils.versions import how_to_install
 
 _APP = "Record3D"
 _METADATA_LIMIT = 1 << 27
 _Side = Annotated[Whole, Field(ge=1, le=1 << 14)]
-_Numbers = list[float]
 
 
 class _Metadata(BaseModel, strict=True):
@@ -45,128 +45,108 @@ class _Metadata(BaseModel, strict=True):
     h: _Side
     dw: _Side | None = None
     dh: _Side | None = None
-    K: Annotated[_Numbers, Field(min_length=9, max_length=9)]
-    poses: list[Annotated[_Numbers, Field(min_length=7, max_length=7)]] = []
-    per_frame: list[Annotated[_Numbers, Field(min_length=4, max_length=4)]] = Field([], alias="perFrameIntrinsicCoeffs")
-
-    @functools.cached_property
-    def moves(self) -> bool:
-        """Whether the poses of the frames differ."""
-        return any(pose != self.poses[0] for pose in self.poses) or len(self.poses) == 1
+    K: Annotated[list[float], Field(min_length=9, max_length=9)]
+    poses: list[Annotated[list[float], Field(min_length=7, max_length=7)]] = []
+    per_frame: list[Annotated[list[float], Field(min_length=4, max_length=4)]] = Field(
+        [], alias="perFrameIntrinsicCoeffs"
+    )
 
 
-def _find(folder: Path) -> PairingResult | None:
+def find(folder: Path) -> PairingResult | None:
     """Return the frames of an unpacked archive or of an export."""
     if (folder / "rgbd").is_dir() and (folder / "metadata").is_file():
-        return _read_archive(folder)
+        return read_archive(folder)
     path = folder / "metadata.json"
     if not path.is_file() or not any((folder / "depth").glob("*.exr")):
         return None
-    content = Archive(folder).read(path.name, _METADATA_LIMIT)
-    if not _is_ours(content):
-        return None
-    metadata = _parse(path, content)
-    photos, depths, confidences = (
-        numbered_files(folder / kind, suffixes)
-        for kind, suffixes in (("rgb", (".jpg", ".jpeg", ".png")), ("depth", (".exr",)), ("conf", (".exr", ".png")))
-    )
-    both, unpaired = paired(photos, depths)
-    pairs = [
-        Pair(f"{number:06}", photos[number], depths[number], unit=1.0, capture=_frame(path, metadata, number),
-             confidence=ConfidenceMap(confidences[number], HIGHEST_LEVEL) if number in confidences else None)
-        for number in both
-    ]  # fmt: skip
-    return PairingResult(tuple(pairs), _found(metadata, pairs), unpaired)
-
-
-def _read_archive(path: Path) -> PairingResult:
-    """Return the frames of an archive or of an unpacked one."""
-    archive = Archive(path)
-    metadata = _parse(path / "metadata", archive.read("metadata", _METADATA_LIMIT))
-    files: dict[str, dict[int, Path]] = {"jpg": {}, "depth": {}, "conf": {}}
-    for name in archive.names():
-        if match := re.fullmatch(r"rgbd/(\d{1,9})\.(jpg|depth|conf)", name):
-            files[match[2]][int(match[1])] = path / name
-    both, unpaired = paired(dict(sorted(files["jpg"].items())), files["depth"])
-    if not both:
-        raise ValueError(f"{path}: expected photos and depth maps of {_APP} in rgbd/, found no pair")
-    size = metadata.dh or metadata.h, metadata.dw or metadata.w
-
-    def member(kind: str, number: int, dtype: str = "") -> Member:
-        name = f"rgbd/{files[kind][number].name}"
-        if not dtype:
-            return Member(archive, name, PHOTO_LIMIT, decode_photo)
-        decoder = functools.partial(decode_lzfse, size=size, dtype=dtype)
-        return Member(archive, name, 4 * size[0] * size[1] + (1 << 16), decoder)
-
-    pairs = []
-    for number in both:
-        frame = _frame(path / "metadata", metadata, number)
-        frame = replace(frame, photo=member("jpg", number), depth=member("depth", number, "<f4"))
-        pair = Pair(f"{number:06}", files["jpg"][number], files["depth"][number], unit=1.0, capture=frame)
-        if number in files["conf"]:
-            confidence = ConfidenceMap(files["conf"][number], HIGHEST_LEVEL, member("conf", number, "u1"))
-            pair = replace(pair, confidence=confidence)
-        pairs.append(pair)
-    return PairingResult(tuple(pairs), _found(metadata, pairs), unpaired)
-
-
-def _found(metadata: _Metadata, pairs: Sequence[Pair]) -> tuple[Assumption, ...]:
-    """Return what was found out about a capture."""
-    found = [describe_capture(f"a capture of {_APP}", "metres", pairs, poses=metadata.moves)]
-    if metadata.poses and not metadata.moves:
-        found.append(Assumption("no poses: those of the capture are all the same"))
-    return tuple(found)
-
-
-def _is_ours(content: bytes) -> bool:
-    """Return whether JSON has the keys of the app, so that a file of another app is left alone."""
+    content = read_part(folder, path.name, _METADATA_LIMIT)
     try:
         entries = json.loads(content)
     except (ValueError, RecursionError):
-        return False
-    return isinstance(entries, dict) and {"K", "w", "h"} <= entries.keys()
+        return None
+    if not isinstance(entries, dict) or not {"K", "w", "h"} <= entries.keys():  # of another app
+        return None
+    files = {
+        "jpg": numbered_files(folder / "rgb", (".jpg", ".jpeg", ".png")),
+        "depth": numbered_files(folder / "depth", (".exr",)),
+        "conf": numbered_files(folder / "conf", (".exr", ".png")),
+    }
+    metadata = parse_model(_Metadata, content, path, f"expected {_APP}'s metadata; ")
+    return _frames(path, metadata, files, lambda *_: None)
 
 
-def _parse(path: Path, content: bytes) -> _Metadata:
-    """Return the metadata."""
-    try:
-        return _Metadata.model_validate(json.loads(content))
-    except ValidationError as error:
-        raise ValueError(f"{path}: expected {_APP}'s metadata; {describe(error)}") from error
-    except (ValueError, RecursionError, OverflowError) as error:
-        raise ValueError(f"{path}: expected {_APP}'s metadata as JSON, got something else") from error
+def read_archive(path: Path) -> PairingResult:
+    """Return the frames of an archive or of an unpacked one."""
+    content, place = read_part(path, "metadata", _METADATA_LIMIT), path / "metadata"
+    metadata = parse_model(_Metadata, content, place, f"expected {_APP}'s metadata; ")
+    files: dict[str, dict[int, Path]] = {"jpg": {}, "depth": {}, "conf": {}}
+    for name in members(path):
+        if match := re.fullmatch(r"rgbd/(\d{1,9})\.(jpg|depth|conf)", name):
+            files[match[2]][int(match[1])] = path / name
+    files["jpg"] = dict(sorted(files["jpg"].items()))
+    size = metadata.dh or metadata.h, metadata.dw or metadata.w
+    decoders: dict[str, Callable[[bytes], np.ndarray]] = {
+        "jpg": decode_photo,
+        "depth": functools.partial(decode_lzfse, size=size, dtype="<f4"),
+        "conf": functools.partial(decode_lzfse, size=size, dtype="u1"),
+    }
+
+    def part(kind: str, number: int) -> Part:
+        name, most = f"rgbd/{files[kind][number].name}", 4 * size[0] * size[1] + (1 << 16)
+        fetch = functools.partial(read_part, path, name, PHOTO_LIMIT if kind == "jpg" else most)
+        return Part(path, name, fetch, decoders[kind])
+
+    found = _frames(place, metadata, files, part)
+    if not found.pairs:
+        raise ValueError(f"{path}: expected photos and depth maps of {_APP} in rgbd/, found no pair")
+    return found
 
 
-def _frame(path: Path, metadata: _Metadata, number: int) -> CaptureFrame:
-    """Return what the metadata say of a frame."""
-    size, K = (metadata.h, metadata.w), metadata.K
-    own = number < len(metadata.per_frame)
-    numbers = metadata.per_frame[number] if own else [K[0], K[4], K[6], K[7]]
-    pose = metadata.poses[number] if metadata.moves and number < len(metadata.poses) else None
-    place, text = f"{path}: frame {number}", "camera: K of the first frame; the metadata have none of each frame"
+def _frames(
+    path: Path, metadata: _Metadata, files: Mapping[str, Mapping[int, Path]], part: Callable[[str, int], Part | None]
+) -> PairingResult:
+    """Return the frames of files by kind and number, each in a part of an archive if it is no file of its own."""
+    both, unpaired = paired(files["jpg"], files["depth"])
+    size, K, poses = (metadata.h, metadata.w), metadata.K, metadata.poses
+    moves = len(poses) == 1 or any(pose != poses[0] for pose in poses)
+    pairs = []
+    for number in both:
+        own = metadata.per_frame[number] if number < len(metadata.per_frame) else None
+        pose = poses[number] if moves and number < len(poses) else None
+        content = repr((size, own or [K[0], K[4], K[6], K[7]], pose)).encode()
+        geometry = stated(_geometry, f"{path}: frame {number}", metadata, own, pose)
+        frame = CaptureFrame(_APP, geometry, path, content, part("jpg", number), part("depth", number))
+        known = files["conf"].get(number)
+        confidence = None if known is None else ConfidenceMap(known, HIGHEST_LEVEL, part("conf", number))
+        places = files["jpg"][number], files["depth"][number]
+        pairs.append(Pair(f"{number:06}", *places, unit=1.0, capture=frame, confidence=confidence))
+    notes = [describe_capture(f"a capture of {_APP}", "metres", pairs, poses=moves)]
+    if poses and not moves:
+        notes.append(Assumption("no poses: those of the capture are all the same"))
+    return PairingResult(tuple(pairs), tuple(notes), unpaired)
+
+
+def _geometry(place: str, metadata: _Metadata, own: list[float] | None, pose: list[float] | None) -> Geometry:
+    """Return camera and pose of a frame, whose intrinsics may be its own."""
+    K = metadata.K
+    camera = intrinsics_camera(place, (metadata.h, metadata.w), own or [K[0], K[4], K[6], K[7]])
+    text = "camera: K of the first frame; the metadata have none of each frame"
     notes = () if own else (Assumption(text),)
-
-    def geometry() -> Geometry:
-        camera = intrinsics_camera(place, size, numbers)
-        if pose is None:
-            return Geometry(camera, None, notes)
-        return Geometry(camera, pose_from_quaternion(place, pose[:4], pose[4:], opengl=True), notes, up="y")
-
-    return CaptureFrame(_APP, stated(geometry), path, repr((size, numbers, pose)).encode())
+    if pose is None:
+        return Geometry(camera, None, notes)
+    return Geometry(camera, pose_from_quaternion(place, pose[:4], pose[4:], opengl=True), notes, up="y")
 
 
-RECORD3D = Capture(
-    _APP,
-    "the `.r3d` archive, or its export EXR + RGB",
-    "`*.r3d`; its unpacked folder (`metadata`, `rgbd/`); `metadata.json` with `rgb/` and `depth/*.exr`",
-    "depth in m (LZFSE, EXR); intrinsics of each frame, else of all; poses; confidence 0 to 2",
-    "a real export of 341 frames",
-    LIDAR,
-    "https://github.com/marek-simonik/record3d/issues/27",
-    _find,
-    _read_archive,
-    (".r3d",),
-    marks=("rgbd/*.depth",),
-    needs={"metadata": ("metadata",)},
-)
+def decode_lzfse(content: bytes, size: Size, dtype: str) -> np.ndarray:
+    """Return the map (h, w) of some type of values that LZFSE data hold; https://github.com/lzfse/lzfse."""
+    with refusing(f"LZFSE data need the package lzfse: {how_to_install('captures')}", ImportError):
+        import lzfse  # noqa: PLC0415 - an extra
+    with refusing(f"expected LZFSE data, got {len(content)} damaged bytes", lzfse.error, MemoryError):
+        values = lzfse.decompress(content)
+    expected = size[0] * size[1] * np.dtype(dtype).itemsize
+    if len(values) != expected:
+        raise ValueError(
+            f"expected {size[1]} x {size[0]} values of {np.dtype(dtype)} ({expected} bytes), "
+            f"got LZFSE data of {len(values)}"
+        )
+    return np.frombuffer(values, dtype).reshape(size)

@@ -1,17 +1,11 @@
 """Recordings of ROS 1 (``.bag``) and ROS 2 (``.mcap``, ``.db3``, or a folder of them with ``metadata.yaml``).
 
-The files in such a folder may be packed (``.zstd``). Messages of sensor_msgs: Image, CompressedImage and CameraInfo,
-http://docs.ros.org/en/api/sensor_msgs/html/index-msg.html; depth is in millimetres as whole numbers and in metres as
-floats, https://ros.org/reps/rep-0118.html.
-
-Depth that is registered to the photos, by the cameras, frame_id or else the topic's name, is taken before other depth,
-photos of a topic named *color*, *colour* or *rgb* before others; then topics with more messages, then the first one.
-Depth of another camera is warped to the photo by /tf_static, /tf or RealSense's ``extrinsics``. A camera is that of the
-topic ``camera_info`` beside the images, for its window and binning and with its distortion; of a topic of
-``image_rect`` its P, without. Photo and depth map are paired by the times in their headers, within 20 ms. Poses are not
-read.
-
-Recordings of RealSense's SDK are those of :mod:`dsr.io.captures.realsense`.
+Messages of sensor_msgs, http://docs.ros.org/en/api/sensor_msgs/html/index-msg.html; depth is in millimetres as whole
+numbers and in metres as floats, https://ros.org/reps/rep-0118.html. Depth that is registered to the photos, by the
+cameras, frame_id or else the topic's name, is taken before other depth, photos of a topic named *color*, *colour* or
+*rgb* before others; then topics with more messages, then the first one. Depth of another camera is warped to the photo
+by /tf_static, /tf or RealSense's ``extrinsics``. A camera is that of the topic ``camera_info`` beside the images, for
+its window and binning and with its distortion; of a topic of ``image_rect`` its P, without. Poses are not read.
 """
 
 from __future__ import annotations
@@ -31,7 +25,9 @@ from dsr.geometry.camera import Lens
 from dsr.geometry.poses import Matrix, as_rigid, from_quaternion, invert
 from dsr.io.captures import realsense
 from dsr.io.captures.bags import (
+    COLOURS,
     COMPRESSED,
+    DEPTHS,
     IMAGE,
     connections_of,
     first_message,
@@ -39,10 +35,8 @@ from dsr.io.captures.bags import (
     naming_recording,
     open_recording,
 )
-from dsr.io.captures.contract import Capture, Shot, pair_by_time
-from dsr.io.captures.ros_images import COLOURS, DEPTHS
 from dsr.io.frames import CaptureFrame, Geometry, Rig, stated
-from dsr.io.pairs import PairingResult, is_registered
+from dsr.io.pairs import PairingResult, Shot, is_registered, pair_by_time
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import naming
@@ -57,13 +51,13 @@ _EXTRINSICS = re.compile(r"(.*/)extrinsics/(\w+)_to_(\w+)")
 _LENSES = {"plumb_bob": "brown_conrady", "rational_polynomial": "brown_conrady", "equidistant": "kannala_brandt"}
 
 
-def _find(folder: Path) -> PairingResult | None:
+def find(folder: Path) -> PairingResult | None:
     """Return the frames of a recording of ROS 2 that is a folder."""
     there = (folder / "metadata.yaml").is_file() and any(any(folder.glob(f"*{each}")) for each in _BESIDE_METADATA)
-    return _read(folder) if there else None
+    return read(folder) if there else None
 
 
-def _read(path: Path) -> PairingResult:
+def read(path: Path) -> PairingResult:
     """Return the frames of a recording."""
     with naming_recording(path):
         reader = open_recording(path)
@@ -73,24 +67,13 @@ def _read(path: Path) -> PairingResult:
         photo, depth = _choose(path, topics)
         photos, depths = (_shots(reader, path, each.name) for each in (photo, depth))
         in_metres = depths[0].source.read().dtype.kind == "f"
-        same = _have_same_frame(photo, depth)
-        motion = np.eye(4) if same else _transform(reader, photo, depth)
+        motion = np.eye(4) if _have_same_frame(photo, depth) else _transform(reader, photo, depth)
     registered = _are_registered(photo, depth)
     if motion is not None and not is_registered(depth.name):
         registered = registered and np.allclose(motion, np.eye(4), rtol=0, atol=_AT_ONE_PLACE)
-
-    def geometry() -> Geometry:
-        if not registered:
-            return _apart(path, photo, depth, motion)
-        found = _camera(path, photo)
-        if same:
-            return found
-        text = f"depth of the frame {depth.frame!r} counts as registered to photos of {photo.frame!r}"
-        code = "" if is_registered(depth.name) else "other-frame"
-        return found._replace(assumptions=(*found.assumptions, Assumption(text, "", code, 1.0 if code else None)))
-
-    described = repr(photo.info if registered else (photo, depth, motion)).encode()
-    frame = CaptureFrame("ROS", stated(geometry), path, described, apart=not registered)
+    geometry = stated(_registered, path, photo, depth) if registered else stated(_apart, path, photo, depth, motion)
+    content = repr(photo.info if registered else (photo, depth, motion)).encode()
+    frame = CaptureFrame("ROS", geometry, path, content, apart=not registered)
     found = pair_by_time(photos, depths, frame, 1.0 if in_metres else 1e-3)
     unit = "metres" if in_metres else "millimetres"
     notes = [Assumption(f"a recording of ROS: photos of {photo.name}, depth in {unit} of {depth.name}")]
@@ -158,10 +141,10 @@ def _choose(path: Path, topics: Sequence[_Topic]) -> tuple[_Topic, _Topic]:
 def _shots(reader: Any, path: Path, topic: str) -> list[Shot]:
     """Return the images of a topic with the times in their headers."""
     shots = []
-    for message, raw in images_of(reader, path, topic):
-        seconds, nanoseconds = struct.unpack_from("<II", raw, 4)  # after a sequence number, or CDR's header
+    for message in images_of(reader, path, topic):
+        seconds, nanoseconds = struct.unpack_from("<II", message.raw, 4)  # after a sequence number, or CDR's header
         stamp = seconds + 1e-9 * nanoseconds if seconds else 1e-9 * message.time
-        shots.append(Shot(Path(f"{path}{topic}"), message, stamp))
+        shots.append(Shot(Path(f"{path}{topic}"), message.source, stamp))
     return shots
 
 
@@ -213,20 +196,15 @@ def _transform(reader: Any, photo: _Topic, depth: _Topic) -> Matrix | None:
 
 
 class _Info(NamedTuple):
-    """What is read of a CameraInfo.
-
-    ``numbers``: fx, fy, cx, cy of (height, width) pixels. ``window``: x, y, width and height of the part of them that
-    the photo shows, 0 for all. ``binning``: how many of them are one pixel of the photo, across and down. ``model``,
-    ``distortion``: of the lens; no numbers without one.
-    """
+    """What is read of a CameraInfo."""
 
     height: int
     width: int
-    numbers: tuple[float, ...]
-    window: tuple[int, int, int, int]
-    binning: tuple[int, int]
-    model: str
-    distortion: tuple[float, ...]
+    numbers: tuple[float, ...]  # fx, fy, cx, cy of (height, width) pixels
+    window: tuple[int, int, int, int]  # x, y, width, height of the part of them that the photo shows, 0 for all
+    binning: tuple[int, int]  # how many of them are one pixel of the photo, across and down
+    model: str  # of the lens
+    distortion: tuple[float, ...]  # empty without one
 
 
 def _camera_info(reader: Any, topic: str, role: str) -> _Info | None:
@@ -240,19 +218,23 @@ def _camera_info(reader: Any, topic: str, role: str) -> _Info | None:
             k, d, p = (info.K, info.D, info.P) if hasattr(info, "K") else (info.k, info.d, info.p)
             rectified = "image_rect" in topic
             matrix = (p[0], p[5], p[2], p[6]) if rectified and p[0] else (k[0], k[4], k[2], k[5])
-            roi = info.roi
-            return _Info(
-                info.height,
-                info.width,
-                tuple(map(float, matrix)),
-                (roi.x_offset, roi.y_offset, roi.width, roi.height),
-                (max(info.binning_x, 1), max(info.binning_y, 1)),
-                info.distortion_model,
-                () if rectified else tuple(map(float, d)),
-            )
+            window = info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height
+            binning = max(info.binning_x, 1), max(info.binning_y, 1)
+            lens = info.distortion_model, () if rectified else tuple(map(float, d))
+            return _Info(info.height, info.width, tuple(map(float, matrix)), window, binning, *lens)
         if role == "depth" or len(place.parts) < 3:
             return None
     return None
+
+
+def _registered(path: Path, photo: _Topic, depth: _Topic) -> Geometry:
+    """Return the camera of a recording whose depth is in the photo's pixels."""
+    found = _camera(path, photo)
+    if _have_same_frame(photo, depth):
+        return found
+    text = f"depth of the frame {depth.frame!r} counts as registered to photos of {photo.frame!r}"
+    code = "" if is_registered(depth.name) else "other-frame"
+    return found._replace(assumptions=(*found.assumptions, Assumption(text, "", code, 1.0 if code else None)))
 
 
 def _apart(path: Path, photo: _Topic, depth: _Topic, motion: Matrix | None) -> Geometry:
@@ -297,17 +279,3 @@ def _camera(path: Path, topic: _Topic) -> Geometry:
         return Geometry(camera)
     text = f"the {what}'s lens distortion is not undone: its model {info.model!r:.40} is not known"
     return Geometry(camera, None, (Assumption(text),))
-
-
-ROS = Capture(
-    "ROS 1 and 2",
-    "`rosbag record`, `ros2 bag record` of a colour and a depth topic with their `camera_info`",
-    "`*.bag`, `*.mcap`, `*.db3`; a folder of them, or of `*.zstd`, with `metadata.yaml`",
-    "depth in mm (16UC1), m (32FC1), compressedDepth (PNG, RVL), warped by `/tf_static`; `camera_info`; time",
-    "written by rosbags",
-    "",
-    "https://docs.ros.org/en/api/sensor_msgs/html/index-msg.html",
-    _find,
-    _read,
-    (".bag", ".mcap", ".db3"),
-)

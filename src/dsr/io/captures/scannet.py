@@ -1,6 +1,7 @@
-"""Recordings of ScanNet (.sens) and of the iPhone in ScanNet++.
+"""ScanNet's recordings (.sens) and their exports with SensReader, and the iPhone's recordings in ScanNet++.
 
-ScanNet; https://github.com/ScanNet/ScanNet, SensReader/python/SensorData.py. Little-endian:
+ScanNet; https://github.com/ScanNet/ScanNet, SensReader/python/SensorData.py. Depth is registered to colour. A ``.sens``
+is little-endian:
 
     uint32 4, uint64 length, the sensor's name
     4 x 16 float32           intrinsics and extrinsics of colour, then of depth, row by row
@@ -10,47 +11,42 @@ ScanNet; https://github.com/ScanNet/ScanNet, SensReader/python/SensorData.py. Li
         16 float32           pose from camera (x right, y down, z forward) to world, -inf where there is none
         4 uint64             times of colour and depth in microseconds, 0 for none; bytes of both; then those bytes
 
-Depth is registered to colour.
-
 ScanNet++; https://github.com/scannetpp/scannetpp, iphone/prepare_iphone_data.py and common/scene_release.py.
-
-    iphone/rgb.mkv (.mp4)    photos, 1920 x 1440; extracted ones in rgb/frame_000000.jpg
-    iphone/depth.bin         for each frame a uint32 of its bytes, and 256 x 192 values: LZ4 of uint16 in millimetres,
-                             or raw deflate of float32 in metres
-    iphone/depth/            extracted maps, frame_000000.png of 16-bit millimetres, instead
-    iphone/pose_intrinsic_imu.json    of each ``frame_000000``: intrinsic, 3 x 3, and aligned_pose, 4 x 4, from camera
-                             (x right, y down, z forward) to the world of the scene's laser scan
+``depth.bin`` has for each frame a uint32 of its bytes, and 256 x 192 values: LZ4 of uint16 in millimetres, or raw
+deflate of float32 in metres.
 """
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import struct
 import zlib
-from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from io import BufferedReader
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, RootModel
 
+from dsr.geometry.camera import Camera
 from dsr.geometry.poses import as_rigid
-from dsr.io.captures.archive import PHOTO_LIMIT, Section, decode_photo, inflate
-from dsr.io.captures.contract import LIDAR, Capture
-from dsr.io.captures.stray import VideoFrame, check_count
-from dsr.io.frames import CaptureFrame, Geometry, Size, stated
-from dsr.io.pairs import Pair, PairingResult, numbered_files
+from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo, inflate, read_section
+from dsr.io.captures.stray import VideoFrame, frames_of_video
+from dsr.io.frames import CaptureFrame, Geometry, Part, Size, stated
+from dsr.io.images import read_numbers
+from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult, numbered_files, paired
 from dsr.io.trajectories import NO_POSE, USUAL_SIZE, describe_capture, fitting_camera, intrinsics_camera
-from dsr.utils.guards import opened, read_text, refusing
-from dsr.utils.validation import describe
+from dsr.notes import Assumption
+from dsr.utils.guards import MOST_TEXT, opened, read_limited, read_text, refusing
+from dsr.utils.validation import parse_model
 from dsr.utils.versions import how_to_install
 
 _BEGINNING, _HEADER, _FRAME = struct.Struct("<IQ"), struct.Struct("<64f2i4IfQ"), struct.Struct("<16f4Q")
 _VERSION = 4
 _LONGEST_NAME, _LARGEST_SIDE, _MOST_FRAMES = 1 << 12, 1 << 14, 1 << 16
+_SIZE = (968, 1296)  # height and width of photos as they are recorded
 
 _JSON, _LARGEST_JSON = "pose_intrinsic_imu.json", 1 << 28
 _VIDEOS = ("rgb.mkv", "rgb.mp4")
@@ -85,9 +81,11 @@ def read_sens(path: Path) -> PairingResult:
             place = start + sum(lengths)
             if len(content) < _FRAME.size or place > size or max(lengths) > PHOTO_LIMIT or not min(lengths):
                 raise ValueError(f"{path}: expected {header.frames} frames, it is damaged or ends in frame {number}")
-            photo = Section(path, f"color/{number}", start, lengths[0], functools.partial(_photo, header))
-            depth = Section(path, f"depth/{number}", start + lengths[0], lengths[1], functools.partial(_depth, header))
-            geometry = stated(_geometry, f"{path}: frame {number}", header, values[:16])
+            read_photo = partial(read_section, path, start, lengths[0])
+            read_depth = partial(read_section, path, start + lengths[0], lengths[1])
+            photo = Part(path, f"color/{number}", read_photo, partial(_photo, header))
+            depth = Part(path, f"depth/{number}", read_depth, partial(_depth, header))
+            geometry = stated(_sens_geometry, f"{path}: frame {number}", header, values[:16])
             about = content[:64] + repr(header).encode()
             frame = CaptureFrame("ScanNet", geometry, path, about, photo, depth)
             files, time = (path / photo.name, path / depth.name), 1e-6 * values[16]
@@ -141,12 +139,47 @@ def _depth(header: _Sens, content: bytes) -> np.ndarray:
     return np.frombuffer(values, "<u2").reshape(header.depth)
 
 
-def _geometry(place: str, header: _Sens, values: tuple[float, ...]) -> Geometry:
+def _sens_geometry(place: str, header: _Sens, values: tuple[float, ...]) -> Geometry:
     """Return camera and pose of a frame."""
     camera, matrix = intrinsics_camera(place, header.photo, header.intrinsics), np.reshape(values, (4, 4))
     if not np.isfinite(matrix).all():
         return Geometry(camera, None, (NO_POSE,))
     return Geometry(camera, as_rigid(matrix, place))
+
+
+def find_export(folder: Path) -> PairingResult | None:
+    """Return the frames of a folder of ScanNet's exports."""
+    matrices = [folder / "intrinsic" / f"intrinsic_{kind}.txt" for kind in ("color", "depth")]
+    matrices = [path for path in matrices if path.is_file()]
+    photos, depths = numbered_files(folder / "color", PHOTO_SUFFIXES), numbered_files(folder / "depth", (".png",))
+    both, unpaired = paired(photos, depths)
+    if not matrices or not both:
+        return None
+    pairs = []
+    for number in both:
+        path = folder / "pose" / f"{photos[number].stem}.txt"
+        content = b"".join(read_limited(each, MOST_TEXT) for each in (*matrices, path) if each.is_file())
+        frame = CaptureFrame("ScanNet", partial(_export_geometry, matrices, path), path, content)
+        pairs.append(Pair(photos[number].stem, photos[number], depths[number], unit=1e-3, capture=frame))
+    note = describe_capture("an export of ScanNet", "millimetres", pairs, poses=(folder / "pose").is_dir())
+    return PairingResult(tuple(pairs), (note,), unpaired)
+
+
+def _export_geometry(matrices: list[Path], path: Path, size: Size) -> Geometry:
+    """Return the camera of the first matrix that fits the photo, else of photos as they are recorded, and the pose."""
+    numbers = [read_numbers(each, 16)[[0, 5, 2, 6]].tolist() for each in matrices]
+    for place, each in enumerate(numbers):
+        with contextlib.suppress(ValueError):  # it is of other pixels
+            return with_pose(fitting_camera(str(matrices[place]), (size,), each), path)
+    return with_pose(fitting_camera(str(matrices[0]), (size, _SIZE), numbers[0]), path)
+
+
+def with_pose(camera: Camera | None, path: Path, notes: tuple[Assumption, ...] = ()) -> Geometry:
+    """Return a camera with the pose of 4 x 4 numbers in a text file; none if it is missing, or tracking was lost."""
+    matrix = read_numbers(path, 16).reshape(4, 4) if path.is_file() else np.full((4, 4), np.nan)
+    if not np.isfinite(matrix).all():
+        return Geometry(camera, None, (*notes, NO_POSE))
+    return Geometry(camera, as_rigid(matrix, str(path)), notes)
 
 
 _Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -160,60 +193,52 @@ class _Entry(BaseModel, strict=True):
     aligned_pose: Annotated[list[_Row4], Field(min_length=4, max_length=4)] | None = None
 
 
-_ENTRIES = TypeAdapter(dict[str, _Entry])
+class _Entries(RootModel[dict[str, _Entry]]):
+    """The JSON by the names of the frames."""
 
 
-def _find_scannetpp(folder: Path) -> PairingResult | None:
+def find_scannetpp(folder: Path) -> PairingResult | None:
     """Return the frames of the iPhone in a scene of ScanNet++, or of its folder ``iphone``."""
     folder = folder / "iphone" if (folder / "iphone" / _JSON).is_file() else folder
     path, packed = folder / _JSON, folder / "depth.bin"
-    depths: Mapping[int, Path | Section] = numbered_files(folder / "depth", (".png",), "frame_")
+    maps, parts = numbered_files(folder / "depth", (".png",), "frame_"), dict[int, Part]()
     photos = numbered_files(folder / "rgb", (".jpg", ".png"), "frame_")
     video = next((folder / name for name in _VIDEOS if (folder / name).is_file()), None)
-    if not path.is_file() or not (depths or packed.is_file()) or not (photos or video):
+    if not path.is_file() or not (maps or packed.is_file()) or not (photos or video):
         return None
-    with refusing(f"{path}: expected intrinsics and poses of frames as JSON, got something else", RecursionError):
-        try:
-            entries = _ENTRIES.validate_json(read_text(path, _LARGEST_JSON))
-        except ValidationError as error:
-            raise ValueError(f"{path}: expected ScanNet++'s intrinsics and poses; {describe(error)}") from error
-    depths = depths or _sections(packed)
-    pairs, unpaired = [], [path for number, path in photos.items() if number not in depths]
-    for number, depth in depths.items():
-        place = depth if isinstance(depth, Path) else packed / depth.name
-        if photos and number not in photos:
-            unpaired.append(place)
-            continue
+    expected = "expected ScanNet++'s intrinsics and poses; "
+    entries = parse_model(_Entries, read_text(path, _LARGEST_JSON), path, expected).root
+    if not maps:
+        parts = _parts(packed)
+        maps = {number: packed / part.name for number, part in parts.items()}
+    frames, warnings = dict[int, VideoFrame](), list[Assumption]()
+    if video is not None and not photos and maps:
+        photos, frames, warnings = frames_of_video(video, maps)
+    both, unpaired = paired(photos, maps)
+    pairs = []
+    for number in sorted(both):
         entry = entries.get(f"frame_{number:06}", _Entry())
-        geometry = functools.partial(_iphone_geometry, f"{path}: frame_{number:06}", entry)
-        frame = CaptureFrame("ScanNet++ iPhone", geometry, path, entry.model_dump_json().encode())
-        if not photos and video is not None:
-            frame = replace(frame, photo=VideoFrame(video, number))
-        if not isinstance(depth, Path):
-            frame = replace(frame, depth=depth)
-        photo = photos.get(number) or (video or folder) / f"{number:06}"
-        pairs.append(Pair(f"{number:06}", photo, place, unit=1e-3, capture=frame))
-    notes = [describe_capture("the iPhone of a scene of ScanNet++", "millimetres", pairs, poses=True)]
-    if not photos and video is not None and depths:
-        notes += check_count(video, max(depths) + 1)
-    return PairingResult(tuple(pairs), tuple(notes), tuple(unpaired))
+        geometry, content = partial(_iphone_geometry, f"{path}: frame_{number:06}", entry), entry.model_dump_json()
+        sources = frames.get(number), parts.get(number)
+        frame = CaptureFrame("ScanNet++ iPhone", geometry, path, content.encode(), *sources)
+        pairs.append(Pair(f"{number:06}", photos[number], maps[number], unit=1e-3, capture=frame))
+    note = describe_capture("the iPhone of a scene of ScanNet++", "millimetres", pairs, poses=True)
+    return PairingResult(tuple(pairs), (note, *warnings), unpaired)
 
 
-def _sections(path: Path) -> dict[int, Section]:
+def _parts(path: Path) -> dict[int, Part]:
     """Return the maps of a file that has one after another."""
-    size, place, found = path.stat().st_size, 0, dict[int, Section]()
-    with opened(path) as file:
-        while place < size:
-            file.seek(place)
-            content = file.read(4)
-            length = int.from_bytes(content, "little")
-            start, place = place + 4, place + 4 + length
-            if not 0 < length <= _LARGEST_MAP or place > size:
-                raise ValueError(
-                    f"{path}: expected maps one by one, map {len(found)} is damaged, or all are compressed together: "
-                    "ScanNet++'s prepare_iphone_data.py unpacks those to depth/"
-                )
-            found[len(found)] = Section(path, f"{len(found):06}", start, length, _map)
+    size, place, found = path.stat().st_size, 0, dict[int, Part]()
+    while place < size:
+        length = int.from_bytes(read_section(path, place, 4), "little")
+        start, place = place + 4, place + 4 + length
+        if not 0 < length <= _LARGEST_MAP or place > size:
+            raise ValueError(
+                f"{path}: expected maps one by one, map {len(found)} is damaged, or all are compressed together: "
+                "ScanNet++'s prepare_iphone_data.py unpacks those to depth/"
+            )
+        fetch = partial(read_section, path, start, length)
+        found[len(found)] = Part(path, f"{len(found):06}", fetch, _map)
     return found
 
 
@@ -236,21 +261,3 @@ def _iphone_geometry(place: str, entry: _Entry, size: Size) -> Geometry:
         (fx, _, cx), (_, fy, cy), _ = entry.intrinsic
         camera = fitting_camera(place, (size, USUAL_SIZE), (fx, fy, cx, cy))
     return Geometry(camera, as_rigid(entry.aligned_pose, place) if entry.aligned_pose else None, tuple(notes))
-
-
-SCANNETPP = Capture(
-    "ScanNet++ iPhone",
-    "`iphone/` of a scene",
-    "`pose_intrinsic_imu.json` with `rgb.mkv` or `rgb/`, and `depth.bin` or `depth/`",
-    "depth in mm (LZ4) or m (deflate), 256 x 192; intrinsics and pose of each frame",
-    "written by its format",
-    LIDAR,
-    "https://github.com/scannetpp/scannetpp/blob/main/iphone/prepare_iphone_data.py",
-    _find_scannetpp,
-    marks=("pose_intrinsic_imu.json", "depth.bin"),
-    needs={
-        "pose_intrinsic_imu.json": ("pose_intrinsic_imu.json",),
-        "depth.bin": ("depth.bin", "depth/*.png"),
-        "rgb.mkv": ("rgb.mkv", "rgb.mp4", "rgb/*.jpg"),
-    },
-)

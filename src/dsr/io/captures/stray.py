@@ -1,15 +1,10 @@
 """Stray Scanner, an app for iPhones and iPads with lidar; https://github.com/strayrobots/scanner, docs/format.md.
 
-    rgb.mp4                  the photos, 1920 x 1440; or extracted ones in rgb/000000.png
-    depth/000000.png         16-bit millimetres, 256 x 192; .npy of millimetres in old versions
-    confidence/000000.png    0 (low) to 2 (high), of the depth map's size
-    camera_matrix.csv        3 x 3 intrinsics of the last frame, in pixels of the video
-    odometry.csv             timestamp, frame, x, y, z, qx, qy, qz, qw; fx, fy, cx, cy since 2026
-
-The odometry's quaternion turns a camera with the axes x right, y down, z forward into ARKit's world, y up: the app
-turns ARKit's camera by 180 degrees around x before it writes the pose (OdometryEncoder.swift). ``frame`` numbers the
-maps, and the video's frames if those are counted that its edit list hides: the app writes the first one at a time
-before 0 (VideoEncoder.swift).
+``camera_matrix.csv`` has the intrinsics of the last frame, in pixels of the video; ``odometry.csv`` a pose for each
+frame, and since 2026 its intrinsics. The odometry's quaternion turns a camera with the axes x right, y down, z forward
+into ARKit's world, y up: the app turns ARKit's camera by 180 degrees around x before it writes the pose
+(OdometryEncoder.swift). ``frame`` numbers the maps, and the video's frames if those are counted that its edit list
+hides: the app writes the first one at a time before 0 (VideoEncoder.swift).
 """
 
 from __future__ import annotations
@@ -21,17 +16,15 @@ import math
 import os
 import re
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from dsr.geometry.camera import Camera
-from dsr.io.captures.contract import LIDAR, Capture
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Record, Size, Source, file_state
-from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult, numbered_files
+from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult, numbered_files, paired
 from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera, pose_from_quaternion
 from dsr.notes import Assumption
 from dsr.utils.decoding import QUIET_DECODERS
@@ -43,14 +36,12 @@ _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _Row = Mapping[str, str]
 
-# Makes FFmpeg decode the frames that the file's edit list hides: Stray Scanner's first one.
-_OPTIONS, _ALL_FRAMES = "OPENCV_FFMPEG_CAPTURE_OPTIONS", "ignore_editlist;1"
-_LOG_LEVEL, _SILENT = "OPENCV_FFMPEG_LOGLEVEL", "-8"
+_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 _LARGEST = 1 << 25  # pixels of a frame, those of 8K; a decoder keeps many frames
 _LOCK = threading.Lock()
 
 
-def _find(folder: Path) -> PairingResult | None:
+def find(folder: Path) -> PairingResult | None:
     """Return the frames of a folder of Stray Scanner."""
     video, matrix, odometry = folder / "rgb.mp4", folder / "camera_matrix.csv", folder / "odometry.csv"
     photos, depths = numbered_files(folder / "rgb", PHOTO_SUFFIXES), numbered_files(folder / "depth", (".png", ".npy"))
@@ -58,36 +49,39 @@ def _find(folder: Path) -> PairingResult | None:
         return None
     confidence, rows = numbered_files(folder / "confidence", (".png",)), _read_odometry(odometry)
     text = read_text(matrix) if matrix.is_file() else ""
-    pairs, unpaired = [], []
-    for number, depth in depths.items():
-        photo = photos.get(number)
-        if photo is None and photos:
-            unpaired.append(depth)
-            continue
+    frames, warnings = dict[int, VideoFrame](), list[Assumption]()
+    if not photos:
+        photos, frames, warnings = frames_of_video(video, depths)
+    both, unpaired = paired(photos, depths)
+    pairs = []
+    for number in sorted(both):
         row = rows.get(number, {})
-        described = (odometry if row else matrix, repr((text, sorted(row.items()))).encode())
+        content = repr((text, sorted(row.items()))).encode()
         geometry = functools.partial(_geometry, folder, number, row, text)
-        frame = CaptureFrame(_APP, geometry, *described, photo=None if photo else VideoFrame(video, number))
+        frame = CaptureFrame(_APP, geometry, odometry if row else matrix, content, frames.get(number))
         known = ConfidenceMap(confidence[number], HIGHEST_LEVEL) if number in confidence else None
         time = next((value for value in numbers_in([row.get("timestamp", "")]) if math.isfinite(value)), None)
-        files = photo or video / f"{number:06}", depth
+        files = photos[number], depths[number]
         pairs.append(Pair(f"{number:06}", *files, unit=1e-3, capture=frame, confidence=known, time=time))
-    unpaired += [path for number, path in photos.items() if number not in depths]
-    notes = [describe_capture(f"a capture of {_APP}", "millimetres", pairs, poses=bool(rows))]
-    if not photos:
-        notes += check_count(video, max(depths) + 1)
-    return PairingResult(tuple(pairs), tuple(notes), tuple(unpaired))
+    note = describe_capture(f"a capture of {_APP}", "millimetres", pairs, poses=bool(rows))
+    return PairingResult(tuple(pairs), (note, *warnings), unpaired)
 
 
-def check_count(video: Path, expected: int) -> list[Assumption]:
-    """Return a warning if a video has another number of frames than there are maps: they may belong to others."""
-    try:
-        with _LOCK:
-            count = _player(video, file_state(video, "a video")).count
-    except ValueError:  # each frame says so when it is read
-        return []
-    text = f"{video.name} has {count} frames, the depth maps count to {expected}: photos may be some frames off"
-    return [] if count == expected else [Assumption(text)]
+def frames_of_video(
+    video: Path, depths: Iterable[int]
+) -> tuple[dict[int, Path], dict[int, VideoFrame], list[Assumption]]:
+    """Return the names and the frames of a video that belong to depth maps of these numbers.
+
+    They may belong to others if the video has another number of frames than there are maps, which is a warning.
+    """
+    frames, warnings = {number: VideoFrame(video, number) for number in depths}, []
+    expected = max(frames) + 1
+    with contextlib.suppress(ValueError), _LOCK:  # each frame says so when it is read
+        count = int(_player(video, file_state(video, "a video")).capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        if count != expected:
+            text = f"{video.name} has {count} frames, the depth maps count to {expected}: photos may be some frames off"
+            warnings.append(Assumption(text))
+    return {number: video / f"{number:06}" for number in frames}, frames, warnings
 
 
 def _read_odometry(path: Path) -> dict[int, _Row]:
@@ -108,7 +102,7 @@ def _read_odometry(path: Path) -> dict[int, _Row]:
     return rows
 
 
-def _geometry(folder: Path, number: int, row: _Row, matrix: str, size: Size) -> Geometry:
+def _geometry(folder: Path, number: int, row: _Row, text: str, size: Size) -> Geometry:
     """Return camera and pose of a frame."""
     place = f"{folder / 'odometry.csv'}: frame {number}"
 
@@ -124,32 +118,24 @@ def _geometry(folder: Path, number: int, row: _Row, matrix: str, size: Size) -> 
         pose = pose_from_quaternion(place, values[3:], values[:3])
     else:
         notes.append(Assumption("no pose: odometry.csv has none of the frame"))
+    intrinsics: list[float] = []
     if all(row.get(name) for name in _INTRINSICS):
-        camera = _camera(folder, place, numbers(_INTRINSICS), size)
-    elif matrix:
-        text = "camera: camera_matrix.csv of the whole capture; odometry.csv has none of each frame"
-        notes.append(Assumption(text))
-        path = folder / "camera_matrix.csv"
-        camera = _camera(folder, str(path), _read_matrix(path, matrix), size)
+        intrinsics = numbers(_INTRINSICS)
+    elif text:
+        notes.append(Assumption("camera: camera_matrix.csv of the whole capture; odometry.csv has none of each frame"))
+        place = str(folder / "camera_matrix.csv")
+        entries = numbers_in(text.replace(",", " ").split())
+        matrix = np.array(entries).reshape(3, 3) if len(entries) == 9 else np.full((3, 3), np.nan)
+        if not np.isfinite(matrix).all() or not np.allclose(matrix[2], (0, 0, 1)):
+            raise ValueError(f"{place}: expected a 3 x 3 matrix of intrinsics, got {text!r:.80}")
+        intrinsics = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
+    if intrinsics:
+        video, sizes = folder / "rgb.mp4", [size]
+        if video.is_file() and (folder / "rgb").is_dir():  # extracted photos may have been made smaller
+            height, width, _ = VideoFrame(video, 0).read().shape
+            sizes.append((height, width))
+        camera = fitting_camera(place, (*sizes, USUAL_SIZE), intrinsics)
     return Geometry(camera, pose, tuple(notes), up="y")
-
-
-def _read_matrix(path: Path, text: str) -> list[float]:
-    """Return fx, fy, cx, cy of the matrix."""
-    values = numbers_in(text.replace(",", " ").split())
-    matrix = np.array(values).reshape(3, 3) if len(values) == 9 else np.full((3, 3), np.nan)
-    if not np.isfinite(matrix).all() or not np.allclose(matrix[2], (0, 0, 1)):
-        raise ValueError(f"{path}: expected a 3 x 3 matrix of intrinsics, got {text!r:.80}")
-    return [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
-
-
-def _camera(folder: Path, place: str, numbers: list[float], size: Size) -> Camera:
-    """Return the camera, of the photo's pixels, or of the video's if extracted photos were made smaller."""
-    video, sizes = folder / "rgb.mp4", [size]
-    if video.is_file() and (folder / "rgb").is_dir():
-        height, width, _ = VideoFrame(video, 0).read().shape
-        sizes.append((height, width))
-    return fitting_camera(place, (*sizes, USUAL_SIZE), numbers)
 
 
 @dataclass(frozen=True)
@@ -173,72 +159,45 @@ class _Player:
     """A video that is open at some frame."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._next = path, 0
-        self._capture = self._open()
-
-    @property
-    def count(self) -> int:
-        """Number of frames that the file declares, those that an edit list hides among them."""
-        return int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self._path = path
+        self._open()
 
     def read(self, index: int) -> np.ndarray:
         """Return a frame; the frames between the last one and this one are skipped."""
         if index < self._next:
-            self._capture.release()
-            self._capture, self._next = self._open(), 0
+            self.capture.release()
+            self._open()
         with QUIET_DECODERS:
             while self._next <= index:
-                if not self._capture.grab():
+                if not self.capture.grab():
                     end = f"the video is damaged or ends after {self._next} frames"
                     raise ValueError(f"{self._path}: expected a frame {index}, {end}")
                 self._next += 1
-            there, frame = self._capture.retrieve()
+            there, frame = self.capture.retrieve()
         if not there:
             raise ValueError(f"{self._path}: expected a picture as frame {index}, it cannot be decoded")
         return cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
 
-    def _open(self) -> cv2.VideoCapture:
+    def _open(self) -> None:
         """Open the video at its first frame."""
-        os.environ.setdefault(_LOG_LEVEL, _SILENT)  # read once; its threads may print messages later
-        with QUIET_DECODERS, _environment(_OPTIONS, _ALL_FRAMES):
-            capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
-        width, height = (capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-        if not capture.isOpened() or not width * height > 0:
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read once; its threads may print messages later
+        before = os.environ.get(_OPTIONS)
+        os.environ[_OPTIONS] = "ignore_editlist;1"  # decodes the frames that it hides: Stray Scanner's first one
+        try:
+            with QUIET_DECODERS:
+                self.capture, self._next = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG), 0
+        finally:
+            del os.environ[_OPTIONS]
+            if before is not None:
+                os.environ[_OPTIONS] = before
+        width, height = (self.capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        if not self.capture.isOpened() or not width * height > 0:
             raise ValueError(f"{self._path}: expected a video, got a damaged or foreign file")
         expect_pixels(self._path, int(height), int(width), _LARGEST)
-        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # intrinsics are those of the pixels as they are stored
-        return capture
+        self.capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # intrinsics are those of the pixels as they are stored
 
 
 @functools.lru_cache(maxsize=1)
 def _player(path: Path, _state: tuple[int, int]) -> _Player:
     """Return the open video."""
     return _Player(path)
-
-
-@contextlib.contextmanager
-def _environment(name: str, value: str) -> Iterator[None]:
-    """Set a variable of the environment for a while."""
-    before = os.environ.get(name)
-    os.environ[name] = value
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[name]
-        else:
-            os.environ[name] = before
-
-
-STRAY = Capture(
-    _APP,
-    "share the scan's folder",
-    "`camera_matrix.csv` or `odometry.csv`, with `depth/` and `rgb.mp4` or `rgb/000000.png`",
-    "depth in mm (16-bit PNG, NPY); intrinsics and pose of each frame; confidence 0 to 2",
-    "tables of a real scan; pictures written by its format",
-    LIDAR,
-    "https://github.com/strayrobots/scanner/blob/main/docs/format.md",
-    _find,
-    marks=("odometry.csv", "camera_matrix.csv"),
-    needs={"depth/": ("depth/*",), "rgb.mp4 or rgb/": ("rgb.mp4", "rgb/*")},
-)
