@@ -1,5 +1,6 @@
 """Data sets in their owners' formats: which scenes, prepared how, kept where."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-import dsr.data.preparation as module
-from dsr.data.preparation import Preparation, PreparedDataset, SceneRecord, make_records
+import dsr.data.scene_source as module
+from dsr.data.scene_source import Preparation, PreparedDataset, SceneRecord, make_records
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.synthetic.rendering import cache_directory
@@ -160,9 +161,12 @@ def test_folder_fingerprint_covers_all_files_and_large_ones_by_size_and_time(fil
     files["deep/c"][0].write_text("4")
     assert data.content("all") != before
     monkeypatch.setattr(module, "_MAX_HASHED", 0)
-    path = files["a"][0]
-    path.write_text("12345")
-    assert module.content_hash(path) == f"a.txt 5 {path.stat().st_mtime_ns}"
+    contents = []
+    for text, changed in (("4", 1), ("5", 1), ("5", 2), ("55", 2)):
+        files["deep/c"][0].write_text(text)
+        os.utime(files["deep/c"][0], (changed, changed))
+        contents.append(data.content("all"))
+    assert (contents[0] == contents[1], len(set(contents))) == (True, 3)
 
 
 @pytest.mark.parametrize(

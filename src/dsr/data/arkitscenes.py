@@ -18,10 +18,9 @@ to the raw data; where there are none, 60 degrees of horizontal view are assumed
 
 from __future__ import annotations
 
-import functools
 import re
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 
@@ -33,8 +32,7 @@ from dsr.data.frame_files import (
     read_frame,
     read_millimetres,
 )
-from dsr.data.preparation import FrameSet
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import PreparedDataset, SceneSelection, make_records
 from dsr.geometry.camera import ASSUMED_FOV, Camera
 from dsr.io.captures.arkit import find_intrinsics
 from dsr.io.images import read_levels, read_numbers
@@ -109,7 +107,7 @@ NOTE = f"there is no .pincam file: {ASSUMED_FOV:g} degrees of horizontal view ar
 DETECTED = ((find_frames, load_frame, "arkitscenes"),)
 
 
-class ARKitScenes(FrameSet):
+class ARKitScenes(PreparedDataset):
     """Frames of ARKitScenes for depth upsampling (Baruch et al., NeurIPS 2021) at their own size, 1920 x 1440."""
 
     def __init__(
@@ -118,10 +116,9 @@ class ARKitScenes(FrameSet):
         expect_one_of("split", split, SPLITS)
         if min_confidence not in range(3):
             raise ValueError(f"min_confidence: expected 0, 1 or 2, got {min_confidence}")
-        find = functools.partial(find_frames, split=split)
-        super().__init__("arkitscenes", root, find, load_frame, scenes, min_confidence=min_confidence)
+        frames = find_frames(Path(root).expanduser(), split)
+        found = make_records(
+            frames, load_frame, "arkitscenes", lambda *files: "" if files[-1] else NOTE, min_confidence=min_confidence
+        )
+        super().__init__("arkitscenes", root, found, scenes)
         self.evaluation = split == "validation"
-
-    def note_of(self, *files: Any) -> str:
-        """Return that the camera is assumed, where it is."""
-        return NOTE if files[-1] is None else ""

@@ -30,7 +30,6 @@ Regions of all are ``glass``, the mask of the objects, ``outside``, all the rest
 
 from __future__ import annotations
 
-import functools
 import math
 import re
 from collections.abc import Sequence
@@ -51,9 +50,8 @@ from dsr.data.frame_files import (
     to_depth,
     walk,
 )
-from dsr.data.preparation import FrameSet
 from dsr.data.reference_depth import smooth_levels
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import PreparedDataset, SceneSelection, make_records
 from dsr.geometry.camera import Camera
 from dsr.io.depth_files import read_depth_file
 from dsr.io.images import read_mask
@@ -168,15 +166,14 @@ def read_camera(path: Path) -> Camera:
 DETECTED = ((find_captures, load_capture, "cleargrasp"), (find_renderings, load_rendering, "cleargrasp_synthetic"))
 
 
-class ClearGrasp(FrameSet):
+class ClearGrasp(PreparedDataset):
     """Captures or renderings of ClearGrasp at their own size."""
 
-    note = NOTE
     regions = ("glass", "outside", "edges")
 
     def __init__(self, root: str, synthetic: bool, split: Split | None = None, scenes: SceneSelection = None) -> None:
         expect_one_of("split", split, (*SPLITS, None))
         name, load = ("cleargrasp_synthetic", load_rendering) if synthetic else ("cleargrasp", load_capture)
-        find = functools.partial(find_renderings if synthetic else find_captures, split=split)
-        super().__init__(name, root, find, load, scenes)
+        frames = (find_renderings if synthetic else find_captures)(Path(root).expanduser(), split)
+        super().__init__(name, root, make_records(frames, load, name, NOTE), scenes)
         self.evaluation = split != "train"

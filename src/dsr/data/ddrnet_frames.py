@@ -16,8 +16,7 @@ import re
 from pathlib import Path
 
 from dsr.data.frame_files import find_beside, name_of, read_frame
-from dsr.data.preparation import FrameSet
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import PreparedDataset, SceneSelection, make_records
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 
@@ -43,8 +42,9 @@ def load_frame(rgb_path: Path, measured_path: Path, truth_path: Path, dataset: s
 DETECTED = ((find_frames, load_frame, "ddrnet"),)
 
 
-class DDRNetFrames(FrameSet):
+class DDRNetFrames(PreparedDataset):
     """Frames of Yan et al. (ECCV 2018) at their own size, the sensor's map as measured at x1."""
 
     def __init__(self, root: str, scenes: SceneSelection = None) -> None:
-        super().__init__("ddrnet", root, find_frames, load_frame, scenes)
+        found = make_records(find_frames(Path(root).expanduser()), load_frame, "ddrnet")
+        super().__init__("ddrnet", root, found, scenes)

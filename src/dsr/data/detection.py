@@ -16,7 +16,7 @@ from pathlib import Path
 import dsr.data
 from dsr.data import middlebury, nyu
 from dsr.data.folder import load_scene
-from dsr.data.preparation import Frames
+from dsr.data.scene_source import Frames
 from dsr.sample import Scene
 from dsr.utils.guards import natural_key
 

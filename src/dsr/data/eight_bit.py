@@ -26,8 +26,7 @@ from typing import Literal
 import torch
 
 from dsr.data.frame_files import expect_size, find_beside, in_natural_order, read_picture
-from dsr.data.preparation import FrameSet
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import PreparedDataset, SceneSelection, make_records
 from dsr.geometry.camera import Camera, baseline_times_focal, from_range
 from dsr.io.images import read_levels
 from dsr.sample import Scene, Unit
@@ -91,13 +90,12 @@ NOTE = "depth is not metric: the camera is invented, and levels are read as disp
 DETECTED = tuple((functools.partial(find_frames, dataset=each), load_frame, each) for each in BENCHMARKS)
 
 
-class EightBit(FrameSet):
+class EightBit(PreparedDataset):
     """Six pairs of Lu et al. (CVPR 2014) or thirty of Middlebury 2001 to 2006, at their own size."""
 
-    note = NOTE
     soft_edges = True
 
     def __init__(self, root: str, benchmark: Literal["lu", "middlebury8"], scenes: SceneSelection = None) -> None:
         expect_one_of("benchmark", benchmark, BENCHMARKS)
-        find = functools.partial(find_frames, dataset=benchmark)
-        super().__init__(benchmark, root, find, load_frame, scenes, BENCHMARKS[benchmark].scenes)
+        found = make_records(find_frames(Path(root).expanduser(), benchmark), load_frame, benchmark, NOTE)
+        super().__init__(benchmark, root, found, scenes, BENCHMARKS[benchmark].scenes)

@@ -60,10 +60,6 @@ class Folder(SceneSource):
         if unknown := self._without_offset.difference(found):
             raise ValueError(f"without_offset: expected names of scenes in {root}, got {', '.join(sorted(unknown))}")
 
-    def scenes(self) -> list[str]:
-        """Return the names of the scenes, in order."""
-        return list(self._scenes)
-
     def load(self, scene: str) -> Scene:
         """Return one scene."""
         return load_scene(self._root / scene, self.name, offset=scene not in self._without_offset)

@@ -18,14 +18,12 @@ objects.
 
 from __future__ import annotations
 
-import functools
 import re
 from pathlib import Path
 from typing import Literal, get_args
 
 from dsr.data.frame_files import find_beside, in_natural_order, read_frame, to_camera
-from dsr.data.preparation import FrameSet
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import PreparedDataset, SceneSelection, make_records
 from dsr.io.images import read_numbers
 from dsr.sample import Scene
 from dsr.utils.guards import expect_one_of
@@ -65,7 +63,7 @@ def load_frame(
 DETECTED = ((find_frames, load_frame, "hammer"),)
 
 
-class Hammer(FrameSet):
+class Hammer(PreparedDataset):
     """Frames of HAMMER at their own size, a camera's map as measured at x1; ``naked`` are those without objects."""
 
     def __init__(
@@ -78,6 +76,6 @@ class Hammer(FrameSet):
     ) -> None:
         expect_one_of("sensor", sensor, get_args(Sensor))
         expect_one_of("split", split, get_args(Split))
-        find = functools.partial(find_frames, sensor=sensor, split=split, naked=naked)
-        super().__init__("hammer", root, find, load_frame, scenes)
+        found = make_records(find_frames(Path(root).expanduser(), sensor, split, naked), load_frame, "hammer")
+        super().__init__("hammer", root, found, scenes)
         self.evaluation = split == "test"

@@ -38,8 +38,7 @@ from dsr.data.frame_files import (
     walk,
 )
 from dsr.data.matlab import read_variables
-from dsr.data.preparation import PreparedDataset, make_records
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import PreparedDataset, SceneSelection, make_records
 from dsr.geometry.camera import Camera
 from dsr.io.images import read_levels
 from dsr.sample import Scene

@@ -22,8 +22,7 @@ from types import MappingProxyType
 from torch import Tensor
 
 from dsr.data.frame_files import expect_size, name_of, read_16bit, read_picture, to_depth, walk
-from dsr.data.preparation import Frames, FrameSet, Preparation, rename_frames
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import Preparation, PreparedDataset, SceneSelection, make_records, rename_frames
 from dsr.geometry.camera import from_range
 from dsr.io.depth_files import ICL_CAMERA as CAMERA
 from dsr.io.depth_files import read_depth_file
@@ -89,7 +88,7 @@ FRAMES = MappingProxyType(
 DETECTED = ((find_frames, load_frame, "icl"),)
 
 
-class ICL(FrameSet):
+class ICL(PreparedDataset):
     """Frames of ICL-NUIM; ``frames`` says which frame each of the paper's names stands for."""
 
     def __init__(
@@ -100,7 +99,6 @@ class ICL(FrameSet):
         crop: float = 0.5,
         frames: Mapping[str, str] = FRAMES,
     ) -> None:
-        def find(folder: Path) -> Frames:
-            return rename_frames(find_frames(folder), frames)
-
-        super().__init__("icl", root, find, load_frame, scenes, tuple(FRAMES), Preparation(size, crop))
+        renamed = rename_frames(find_frames(Path(root).expanduser()), frames)
+        found = make_records(renamed, load_frame, "icl")
+        super().__init__("icl", root, found, scenes, tuple(FRAMES), Preparation(size, crop))

@@ -34,9 +34,8 @@ from torch import Tensor
 
 from dsr.data.download.collections import CATALOGUE
 from dsr.data.frame_files import expect_size, read_picture
-from dsr.data.preparation import Preparation, PreparedDataset, SceneRecord
 from dsr.data.reference_depth import smooth_levels
-from dsr.data.scene_source import WITHOUT_OFFSET, SceneSelection
+from dsr.data.scene_source import WITHOUT_OFFSET, Preparation, PreparedDataset, SceneRecord, SceneSelection
 from dsr.geometry.camera import Camera, from_range
 from dsr.io.images import read_levels, read_map
 from dsr.sample import Scene

@@ -29,8 +29,7 @@ import torch
 
 from dsr.data.frame_files import expect_size, find_beside, in_natural_order, read_picture, to_depth
 from dsr.data.matlab import expect_own_values
-from dsr.data.preparation import Preparation, PreparedDataset, make_records
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import Preparation, PreparedDataset, SceneSelection, make_records
 from dsr.geometry.camera import Camera
 from dsr.io.images import read_map
 from dsr.sample import Scene

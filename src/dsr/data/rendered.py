@@ -35,11 +35,8 @@ class Procedural(SceneSource):
                 f"dataset: expected count at least 1, size at least 32, seed at least 0; got {count}, {size}, {seed}"
             )
         expect_room_for(size)
-        self._count, self._size, self._seed = count, size, seed
-
-    def scenes(self) -> list[str]:
-        """Return the names of the scenes: their numbers."""
-        return [f"{index:05d}" for index in range(self._count)]
+        self._size, self._seed = size, seed
+        self._scenes = [f"{index:05d}" for index in range(count)]
 
     def load(self, scene: str) -> Scene:
         """Return one scene."""
@@ -94,10 +91,6 @@ class SimGeo(SceneSource):
             self._lucy = Folder(root, ["lucy"], self.name)
             available[available.index("statue")] = "lucy"
         self._scenes = select_scenes(available, scenes)
-
-    def scenes(self) -> list[str]:
-        """Return the names of the scenes, in order."""
-        return list(self._scenes)
 
     def load(self, scene: str) -> Scene:
         """Return one scene."""

@@ -20,7 +20,6 @@ No camera is published; 60 degrees of horizontal view are assumed.
 
 from __future__ import annotations
 
-import functools
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -36,8 +35,7 @@ from dsr.data.frame_files import (
     read_millimetres,
     walk,
 )
-from dsr.data.preparation import FrameSet
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import PreparedDataset, SceneSelection, make_records
 from dsr.sample import Scene
 from dsr.utils.guards import expect_one_of
 
@@ -84,15 +82,14 @@ def _find_owners_layout(root: Path, split: Split | None, *, measured: bool) -> I
 DETECTED = ((find_frames, load_pair, "rgbdd"),)
 
 
-class RGBDD(FrameSet):
+class RGBDD(PreparedDataset):
     """Images of RGB-D-D at their own size; ``real`` ones have the phone's depth as the measured map."""
 
-    note = NO_CAMERA
     soft_edges = True
 
     def __init__(self, root: str, real: bool, split: Split = "test", scenes: SceneSelection = None) -> None:
         expect_one_of("split", split, COUNTS)
         name, load = ("rgbdd_real", load_measured_frame) if real else ("rgbdd", load_pair)
-        find = functools.partial(find_frames, split=split, measured=real)
-        super().__init__(name, root, find, load, scenes, count=COUNTS[split])
+        found = make_records(find_frames(Path(root).expanduser(), split, real), load, name, NO_CAMERA)
+        super().__init__(name, root, found, scenes, count=COUNTS[split])
         self.evaluation = split == "test"

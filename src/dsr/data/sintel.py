@@ -15,7 +15,6 @@ Both binary files are little-endian and start with the number 202021.25 as a flo
 
 from __future__ import annotations
 
-import functools
 import struct
 from pathlib import Path
 from types import MappingProxyType
@@ -25,8 +24,7 @@ import numpy as np
 from torch import Tensor
 
 from dsr.data.frame_files import expect_size, read_picture, to_camera, to_depth
-from dsr.data.preparation import FrameSet, Preparation
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import Preparation, PreparedDataset, SceneSelection, make_records
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.utils.guards import MOST_FILE, natural_key, read_limited
@@ -108,7 +106,7 @@ def sintel_frames() -> tuple[str, ...]:
 DETECTED = ((find_frames, load_frame, "sintel"),)
 
 
-class Sintel(FrameSet):
+class Sintel(PreparedDataset):
     """Frames of MPI Sintel (Butler et al., ECCV 2012); ``final`` renderings have blur, fog and the like."""
 
     evaluation = False
@@ -121,6 +119,6 @@ class Sintel(FrameSet):
         rendering: Literal["clean", "final"] = "clean",
         farthest: float = FARTHEST,
     ) -> None:
-        find = functools.partial(find_frames, rendering=rendering)
+        found = make_records(find_frames(Path(root).expanduser(), rendering), load_frame, "sintel", farthest=farthest)
         preparation = Preparation(size, crop=None, enlarge=False)
-        super().__init__("sintel", root, find, load_frame, scenes, sintel_frames(), preparation, farthest=farthest)
+        super().__init__("sintel", root, found, scenes, sintel_frames(), preparation)

@@ -28,8 +28,7 @@ import torch
 
 from dsr.data.download.collections import CATALOGUE
 from dsr.data.frame_files import find_beside, in_natural_order, read_frame
-from dsr.data.preparation import FrameSet
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import PreparedDataset, SceneSelection, make_records
 from dsr.geometry.camera import Camera, Lens
 from dsr.sample import Scene
 from dsr.utils.versions import file_hash
@@ -122,10 +121,11 @@ def _find_pinned(root: Path) -> dict[str, tuple[Path, Path, str]]:
 DETECTED = ((_find_pinned, load_frame, "stereo_board"),)
 
 
-class StereoBoard(FrameSet):
+class StereoBoard(PreparedDataset):
     """Five frames of a stereo camera before an exact plane, at their own size, its map as measured at x1."""
 
     regions = ("board", "border")
 
     def __init__(self, root: str, scenes: SceneSelection = None) -> None:
-        super().__init__("stereo_board", root, find_frames, load_frame, scenes, tuple(BOARDS))
+        found = make_records(find_frames(Path(root).expanduser()), load_frame, "stereo_board")
+        super().__init__("stereo_board", root, found, scenes, tuple(BOARDS))

@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 from torch import Tensor
 
@@ -33,8 +32,7 @@ from dsr.data.frame_files import (
     to_depth,
     walk,
 )
-from dsr.data.preparation import Frames, FrameSet, Preparation, rename_frames
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import Preparation, PreparedDataset, SceneSelection, make_records, rename_frames
 from dsr.geometry.camera import Camera
 from dsr.io.encoding import turn_back_bits
 from dsr.io.images import read_numbers
@@ -123,7 +121,7 @@ FRAMES = MappingProxyType(
 DETECTED = ((find_frames, load_frame, "sunrgbd"),)
 
 
-class SunRGBD(FrameSet):
+class SunRGBD(PreparedDataset):
     """Scenes of SUN RGB-D; the true depth is what the sensor measured, with its holes, or the authors' refined one."""
 
     def __init__(
@@ -139,15 +137,13 @@ class SunRGBD(FrameSet):
         if intrinsics is not None and len(intrinsics) != 4:
             raise ValueError(f"intrinsics: expected fx, fy, cx, cy, got {len(intrinsics)} numbers")
 
-        def find(folder: Path) -> Frames:
-            found = find_frames(folder)
-            return rename_frames(found, {name: _first_below(found, path) for name, path in frames.items()})
-
-        settings: dict[str, Any] = {"refined": refined, "intrinsics": intrinsics and tuple(intrinsics)}
-        super().__init__("sunrgbd", root, find, load_frame, scenes, tuple(FRAMES), Preparation(size, crop), **settings)
-
-
-def _first_below(found: Frames, path: str) -> str:
-    """Return the first scene whose name is or begins with a path, below ``SUNRGBD`` or not; the path where none is."""
-    beginnings = tuple(f"{above}{path}/".replace("/", "_") for above in ("", "SUNRGBD/"))
-    return next((name for name in found if f"{name}_".replace("/", "_").startswith(beginnings)), path)
+        all_frames = find_frames(Path(root).expanduser())
+        places = {}
+        for name, path in frames.items():  # the first scene below a path, which may be below SUNRGBD
+            beginnings = tuple(f"{above}{path}/".replace("/", "_") for above in ("", "SUNRGBD/"))
+            below = (each for each in all_frames if f"{each}_".replace("/", "_").startswith(beginnings))
+            places[name] = next(below, path)
+        given = intrinsics and tuple(intrinsics)
+        renamed = rename_frames(all_frames, places)
+        found = make_records(renamed, load_frame, "sunrgbd", refined=refined, intrinsics=given)
+        super().__init__("sunrgbd", root, found, scenes, tuple(FRAMES), Preparation(size, crop))

@@ -17,7 +17,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -25,8 +24,7 @@ from torch import Tensor
 
 from dsr.data.frame_files import expect_size, given_camera, in_natural_order, name_of, read_picture, to_depth, walk
 from dsr.data.matlab import read_variables
-from dsr.data.preparation import FrameSet
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import PreparedDataset, SceneSelection, make_records
 from dsr.io.images import read_levels
 from dsr.sample import Scene
 
@@ -208,7 +206,7 @@ ESTIMATED = (549.2, 549.2, 375.2, 334.3)  # fx, fy, cx, cy in pixels of the 610 
 DETECTED = ((find_frames, load_frame, "tofmark"),)
 
 
-class ToFMark(FrameSet):
+class ToFMark(PreparedDataset):
     """Scenes of ToFMark at their original size, with the samples as measured maps at x4 and x8."""
 
     def __init__(
@@ -222,11 +220,13 @@ class ToFMark(FrameSet):
         for name, values, count in (("intrinsics", intrinsics, 4), ("depth_range", depth_range, 2)):
             if values is not None and len(values) != count:
                 raise ValueError(f"{name}: expected {count} numbers, got {len(values)}")
-        if intrinsics is None:
-            self.note = "the benchmark has no camera: it is an estimate"
-        settings: dict[str, Any] = {
-            "intrinsics": tuple(intrinsics or ESTIMATED),
-            "depth_range": depth_range and tuple(depth_range),
-            "variables": variables and dict(variables),
-        }
-        super().__init__("tofmark", root, find_frames, load_frame, scenes, SCENES, **settings)
+        found = make_records(
+            find_frames(Path(root).expanduser()),
+            load_frame,
+            "tofmark",
+            "the benchmark has no camera: it is an estimate" if intrinsics is None else "",
+            intrinsics=tuple(intrinsics or ESTIMATED),
+            depth_range=depth_range and tuple(depth_range),
+            variables=variables and dict(variables),
+        )
+        super().__init__("tofmark", root, found, scenes, SCENES)
