@@ -27,7 +27,7 @@ from small_files import written
 from small_lpips import random_trunk
 
 from dsr.cli import main
-from dsr.data.download.collections import Collection, Item
+from dsr.data.download import Collection, Item
 from dsr.data.download.fetching import state, unpack, verify
 from dsr.data.folder import Folder
 from dsr.data.ibims import IBims

@@ -17,8 +17,7 @@ from pathlib import Path
 import pytest
 
 from dsr.cli import main
-from dsr.data.download import fetching
-from dsr.data.download.collections import Collection, Item
+from dsr.data.download import Collection, Item, fetching
 from dsr.data.download.fetching import Checksums, get, lock_directory, state, verify
 from dsr.utils.progress import Progress
 

@@ -12,7 +12,7 @@ import dsr.data.scene_source as module
 from dsr.data.scene_source import Preparation, PreparedDataset, SceneRecord, make_records
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
-from dsr.synthetic.rendering import cache_directory
+from dsr.synthetic import cache_directory
 
 
 @pytest.fixture(autouse=True)

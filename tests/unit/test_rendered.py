@@ -12,8 +12,8 @@ import pytest
 
 from dsr.data import rendered
 from dsr.data.rendered import Procedural, SimGeo
+from dsr.synthetic import cache_directory
 from dsr.synthetic.procedural.random_scene import render_random_scene
-from dsr.synthetic.rendering import cache_directory
 from dsr.synthetic.simgeo import SCENES, render_scene
 from dsr.utils.console import note_once
 

@@ -18,7 +18,6 @@ to the raw data; where there are none, 60 degrees of horizontal view are assumed
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Literal
 
@@ -42,7 +41,6 @@ from dsr.utils.guards import expect_one_of
 Split = Literal["validation", "training"]
 SPLITS: tuple[Split, ...] = ("validation", "training")
 _SIZE, _SIZE_LR = (1440, 1920), (192, 256)
-_PHOTO = re.compile(r"(\d+_\d+\.\d+)\.png")
 _HIGHEST_CONFIDENCE = 2
 Files = tuple[Path, Path, Path, Path | None, Path | None]
 
@@ -52,7 +50,7 @@ def find_frames(root: Path, split: Split | None = None) -> dict[str, Files]:
     found: dict[str, Files] = {}
     for folder in ("wide", "color"):
         others = ("highres_depth/{}.png", "lowres_depth/{}.png")
-        for place, frame, (photo, truth, measured) in find_beside(root, folder, _PHOTO, others):
+        for place, frame, (photo, truth, measured) in find_beside(root, folder, r"(\d+_\d+\.\d+)\.png", others):
             if split is None or ("Training" in place.resolve().parts) == (split == "training"):
                 confidence = place / "confidence" / photo.name
                 known = confidence if confidence.is_file() else None

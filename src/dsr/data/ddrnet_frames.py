@@ -12,7 +12,6 @@ The camera is that of the authors' losses (src/losses.py), taken as it is: pixel
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 from dsr.data.frame_files import find_beside, name_of, read_frame
@@ -21,14 +20,13 @@ from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 
 CAMERA = Camera(640, 480, 536.628, 536.606, 310.591, 234.759)
-_PHOTO = re.compile(r"(.+)\.png")
 
 
 def find_frames(root: Path) -> dict[str, tuple[Path, Path, Path]]:
     """Return photos, sensor's and true depth by name "20170907/group1/frame_000001", in order."""
     found = {}
     others = ("depth_map/{}.png", "high_quality_depth/{}.png")
-    for place, frame, (photo, measured, truth) in find_beside(root, "color_map", _PHOTO, others):
+    for place, frame, (photo, measured, truth) in find_beside(root, "color_map", r"(.+)\.png", others):
         found[name_of(root, place, frame)] = (photo, measured, truth)
     return found
 

@@ -136,7 +136,7 @@ def name_of(root: Path, folder: Path, frame: str = "") -> str:
 
 
 def find_beside(
-    root: Path, photos: str, pattern: re.Pattern[str], others: Sequence[str]
+    root: Path, photos: str, pattern: str, others: Sequence[str]
 ) -> Iterator[tuple[Path, str, tuple[Path, ...]]]:
     """Yield the frames of a data set that has its photos in one folder and their maps in folders beside it.
 
@@ -147,7 +147,7 @@ def find_beside(
     for place, below, _ in walk(root):
         if photos in below:
             for photo in sorted((place / photos).iterdir(), key=natural_key):
-                if match := pattern.fullmatch(photo.name):
+                if match := re.fullmatch(pattern, photo.name):
                     files = (photo, *(place / other.format(match[1]) for other in others))
                     if all(path.is_file() for path in files):
                         yield place, match[1], files

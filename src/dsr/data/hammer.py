@@ -32,7 +32,6 @@ Sensor = Literal["d435", "tof", "l515"]
 Split = Literal["test", "train"]
 TEST = (12, 13, 14)  # numbers of the scenes to test on
 _SEQUENCE = re.compile(r"scene(\d+)_traj\d+(_naked)?_\d+")
-_PHOTO = re.compile(r"(\d+)\.png")
 
 
 def find_frames(
@@ -41,7 +40,7 @@ def find_frames(
     """Return photo, measured and true depth, and intrinsics by name "scene12_traj1_1/000000", in order."""
     found = {}
     others = (f"depth_{sensor}/{{}}.png", "_gt/{}.png", "intrinsics.txt")
-    for place, frame, (photo, measured, truth, intrinsics) in find_beside(root, "rgb", _PHOTO, others):
+    for place, frame, (photo, measured, truth, intrinsics) in find_beside(root, "rgb", r"(\d+)\.png", others):
         sequence = place.resolve().parent.name
         match = _SEQUENCE.fullmatch(sequence)
         if match is None or bool(match[2]) != naked:

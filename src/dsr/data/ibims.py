@@ -19,7 +19,6 @@ Regions are ``planes``, numbered from 1 (walls, then tables, then floors), and `
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -50,7 +49,6 @@ FARTHEST = 50.0  # depth of the largest value in pictures, metres
 _VALID = ("mask_invalid", "mask_transp")
 _PLANES = ("mask_wall", "mask_table", "mask_floor")
 _MASKS = (*_VALID, "edges", *_PLANES)
-_PHOTO = re.compile(r"(.+)\.png")
 Pictures = tuple[Path, Path, Path, *tuple[Path | None, ...]]
 
 
@@ -67,7 +65,7 @@ def find_pictures(root: Path) -> dict[str, Pictures]:
     """Return the files of scenes in folders, the first arguments of :func:`load_pictures`, by name, in order."""
     found: dict[str, Pictures] = {}
     needed = ("depth/{}.png", "calib/{}.txt", *(f"{mask}/{{}}.png" for mask in _VALID))
-    for place, name, (photo, depth, calibration, *_) in find_beside(root, "rgb", _PHOTO, needed):
+    for place, name, (photo, depth, calibration, *_) in find_beside(root, "rgb", r"(.+)\.png", needed):
         masks = (place / mask / photo.name for mask in _MASKS)
         found[name] = (photo, depth, calibration, *(path if path.is_file() else None for path in masks))
     return in_natural_order(found)

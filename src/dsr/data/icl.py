@@ -30,7 +30,7 @@ from dsr.sample import Scene
 
 FARTHEST = 100.0  # largest depth in metres; longer rays have hit nothing
 LEVELS = 5000  # levels per metre of the depth pictures
-_RENDERED = re.compile(r"scene_00_(\d+)\.depth")
+_RENDERED, _NUMBER = re.compile(r"scene_00_(\d+)\.depth"), re.compile(r"\d{1,9}")
 _SIZE = (480, 640)
 
 
@@ -40,7 +40,10 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
     for folder, below, files in walk(root):
         if "rgb" in below and "depth" in below:
             below[:] = [name for name in below if name not in ("rgb", "depth")]
-            colours, depths = _numbered(folder / "rgb"), _numbered(folder / "depth")
+            colours, depths = (
+                {int(path.stem): path for path in (folder / kind).glob("*.png") if _NUMBER.fullmatch(path.stem)}
+                for kind in ("rgb", "depth")
+            )
             for number in sorted(colours.keys() & depths.keys()):
                 found[name_of(root, folder, f"{number:04d}")] = (colours[number], depths[number])
         if "rgb.png" in files and "depth.png" in files:
@@ -66,11 +69,6 @@ def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Sce
     rgb = read_picture(rgb_path)
     expect_size(rgb_path, rgb, _SIZE)
     return Scene(dataset, name, rgb, CAMERA, read_depth(depth_path))
-
-
-def _numbered(folder: Path) -> dict[int, Path]:
-    """Return the pictures of a folder by number."""
-    return {int(path.stem): path for path in folder.glob("*.png") if re.fullmatch(r"\d{1,9}", path.stem)}
 
 
 FRAMES = MappingProxyType(
@@ -99,6 +97,5 @@ class ICL(PreparedDataset):
         crop: float = 0.5,
         frames: Mapping[str, str] = FRAMES,
     ) -> None:
-        renamed = rename_frames(find_frames(Path(root).expanduser()), frames)
-        found = make_records(renamed, load_frame, "icl")
+        found = make_records(rename_frames(find_frames(Path(root).expanduser()), frames), load_frame, "icl")
         super().__init__("icl", root, found, scenes, tuple(FRAMES), Preparation(size, crop))

@@ -143,18 +143,12 @@ def inpaint_depth(depth: Tensor) -> Tensor:
         window = tuple(slice(max(side.start - 1, 0), side.stop + 1) for side in place)
         hole = labels[window] == label
         rim = ndimage.binary_dilation(hole) & ~holes[window]
-        used = rim & (inverse[window] <= _farther_part(inverse[window][rim]))
+        beside = np.sort(inverse[window][rim])
+        gaps = np.diff(beside)
+        stepped = gaps.size and gaps.max() > _STEP * beside[0]  # the rim's part beyond a depth step is used
+        used = rim & (inverse[window] <= beside[gaps.argmax() if stepped else -1])
         inverse[window][hole] = _solve_laplace(np.where(used, inverse[window], 0), hole, used)
     return torch.from_numpy(1 / inverse)[None]
-
-
-def _farther_part(rim: np.ndarray) -> float:
-    """Return the largest inverse depth of the rim's part beyond a depth step, or of the whole rim if it has none."""
-    values = np.sort(rim)
-    gaps = np.diff(values)
-    if not gaps.size or gaps.max() <= _STEP * values[0]:
-        return float(values[-1])
-    return float(values[gaps.argmax()])
 
 
 def _solve_laplace(values: np.ndarray, hole: np.ndarray, rim: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """``dataset=procedural``, random scenes to train on, and ``dataset=simgeo``, scenes like the paper's: rendered here.
 
 The paper's sixth scene, Lucy, replaces the statue where ``root/lucy`` holds it in the layout of
-:mod:`dsr.data.folder`. Renderings are cached, see :func:`dsr.synthetic.rendering.cache_directory`.
+:mod:`dsr.data.folder`. Renderings are cached, see :func:`dsr.synthetic.cache_directory`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from pathlib import Path
 from dsr.data.folder import Folder
 from dsr.data.scene_source import SceneSelection, SceneSource, select_scenes
 from dsr.sample import Scene
+from dsr.synthetic import Rendering, cache_directory, expect_room_for, load_or_render
 from dsr.synthetic.procedural.random_scene import PROCEDURAL_VERSION, render_random_scene
-from dsr.synthetic.rendering import Rendering, cache_directory, expect_room_for, load_or_render
 from dsr.synthetic.simgeo import SCENES, SCENES_VERSION, render_scene
 from dsr.utils.processes import Pool
 from dsr.utils.progress import SILENT

@@ -20,8 +20,6 @@ No camera is published; 60 degrees of horizontal view are assumed.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -43,7 +41,6 @@ Split = Literal["test", "train"]
 COUNTS = {"test": 405, "train": 2215}  # numbers of scenes
 RATIO = 8 / 3  # of the photo's size and that of the phone's depth
 Files = tuple[Path, ...]
-_PHOTO = re.compile(r"(\d+)_RGB\.jpg")
 _PARTS = ("models", "plants", "portraits")
 _DEPTH, _MEASURED = "{0}_HR_gt.png", "{0}_LR_fill_depth.png"
 
@@ -51,12 +48,16 @@ _DEPTH, _MEASURED = "{0}_HR_gt.png", "{0}_LR_fill_depth.png"
 def find_frames(root: Path, split: Split | None = None, measured: bool = False) -> dict[str, Files]:
     """Return photos, true depth and, if ``measured``, the phone's depth, by their number "20200509112638", in order."""
     found: dict[str, Files] = {}
-    for name, files in _find_owners_layout(root, split, measured=measured):
-        found.setdefault(name, files)
+    names = ("{0}_RGB.jpg", _DEPTH, _MEASURED)[: 3 if measured else 2]
+    parts = [f"{part}_{each}" for part in _PARTS for each in COUNTS if split in (None, each)]
+    for folder, _, files in walk(root):  # as its owners hand it out
+        wanted = [name.format(folder.name) for name in names]
+        if folder.parent.name in parts and set(wanted) <= set(files):
+            found.setdefault(folder.name, tuple(folder / name for name in wanted))
     if split in (None, "test"):  # those in circulation
         others = (f"Depth/{_DEPTH}", f"DepthLR/{_MEASURED}")[: 2 if measured else 1]
-        for _, name, files in find_beside(root, "RGB", _PHOTO, others):
-            found.setdefault(name, files)
+        for _, number, paths in find_beside(root, "RGB", r"(\d+)_RGB\.jpg", others):
+            found.setdefault(number, paths)
     return in_natural_order(found)
 
 
@@ -66,17 +67,6 @@ def load_measured_frame(rgb_path: Path, depth_path: Path, measured_path: Path, d
     size = (round(scene.camera.height / RATIO), round(scene.camera.width / RATIO))
     expect_size(measured_path, measured, size)
     return replace(scene, measured={scene.camera.width / size[1]: measured})
-
-
-def _find_owners_layout(root: Path, split: Split | None, *, measured: bool) -> Iterator[tuple[str, Files]]:
-    """Yield the number and the files of the images that have a folder each."""
-    names = ("{0}_RGB.jpg", _DEPTH, _MEASURED)[: 3 if measured else 2]
-    folders = [f"{part}_{each}" for part in _PARTS for each in COUNTS if split in (None, each)]
-    for folder, _, files in walk(root):
-        if folder.parent.name in folders:
-            wanted = [name.format(folder.name) for name in names]
-            if set(wanted) <= set(files):
-                yield folder.name, tuple(folder / name for name in wanted)
 
 
 DETECTED = ((find_frames, load_pair, "rgbdd"),)

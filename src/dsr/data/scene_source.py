@@ -21,7 +21,7 @@ import torch
 
 from dsr.data.reference_depth import fit, inpaint_depth
 from dsr.sample import Scene
-from dsr.synthetic.rendering import Rendering, cache_directory, expect_room_for, load_or_render
+from dsr.synthetic import Rendering, cache_directory, expect_room_for, load_or_render
 from dsr.utils.guards import derived, readable
 from dsr.utils.progress import SILENT, Progress
 from dsr.utils.versions import SCENES, hash_once

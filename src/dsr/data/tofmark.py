@@ -38,11 +38,8 @@ _ROLES: Mapping[str, tuple[str, ...]] = {
     "depth": ("truth|gt", "hr|highres", "depth"),
     "samples": ("tof", "sparse|projected", "lr|mr|lowres", "depth"),
 }
-_OTHERS = {
-    "intensity": re.compile("weight|mask|conf|amplitude|depth|tof|disp"),
-    "depth": re.compile("weight|mask|conf|amplitude"),
-    "samples": re.compile("weight|mask|conf|amplitude"),
-}
+_OTHER = "weight|mask|conf|amplitude"  # in the names of variables that are none of these
+_NO_INTENSITY = f"{_OTHER}|depth|tof|disp"
 
 
 def find_frames(root: Path) -> dict[str, tuple[Path, Path | None]]:
@@ -83,7 +80,14 @@ def load_frame(
         rgb, depth, samples = read_matrices(path, variables)
     else:
         rgb = read_picture(path)
-        samples = _metres(samples_path, *read_samples(samples_path), depth_range)
+        levels, known = read_samples(samples_path)
+        if depth_range is None:
+            ends = "depth_range=(metres of 1, metres of 255)"
+            raise ValueError(f"{samples_path}: expected {ends}, as 8 bits have lost the metric scale")
+        near, far = depth_range
+        if not 0 < near < far < np.inf:
+            raise ValueError(f"depth_range: expected 0 < metres of 1 < metres of 255, got {near:g} and {far:g}")
+        samples = torch.where(known, near + (levels * 255 - 1) / 254 * (far - near), torch.nan)
         expect_size(samples_path, samples, tuple(rgb.shape[1:]))
     camera = given_camera(intrinsics, (rgb.shape[1], rgb.shape[2]))
     measured: dict[float, Tensor] = {}
@@ -131,27 +135,19 @@ def block_means(depth: Tensor, factor: int) -> Tensor:
     return inverse.nanmean(dim=(2, 4)).reciprocal()
 
 
-def _metres(path: Path, values: Tensor, known: Tensor, depth_range: tuple[float, float] | None) -> Tensor:
-    """Return the depth of levels over 255, NaN where there is no sample."""
-    if depth_range is None:
-        raise ValueError(
-            f"{path}: expected depth_range=(metres of 1, metres of 255), as 8 bits have lost the metric scale"
-        )
-    near, far = depth_range
-    if not 0 < near < far < np.inf:
-        raise ValueError(f"depth_range: expected 0 < metres of 1 < metres of 255, got {near:g} and {far:g}")
-    return torch.where(known, near + (values * 255 - 1) / 254 * (far - near), torch.nan)
-
-
 def _fitting_variable(path: Path, role: str, found: Mapping[str, np.ndarray], chosen: Mapping[str, str]) -> str | None:
     """Return the variable that fits a role by its size and best by its name; None where none fits."""
     size = found[chosen["intensity"]].shape[:2] if "intensity" in chosen else None
     names = {name: re.sub(r"[^a-z0-9]", "", name.rpartition(".")[2].lower()) for name in found}
-    fitting = [
-        name
-        for name, array in found.items()
-        if name not in chosen.values() and not _OTHERS[role].search(names[name]) and _fits(role, array, size)
-    ]
+    fitting = []
+    for name, array in found.items():
+        if role == "intensity":
+            fits = min(array.shape[:2]) >= _SMALLEST and (array.ndim == 2 or array.shape[2:] == (3,))
+        else:
+            fits = array.shape == size and ((array > 0).mean() < _SPARSE) == (role == "samples")
+        other = re.search(_NO_INTENSITY if role == "intensity" else _OTHER, names[name])
+        if fits and not other and name not in chosen.values():
+            fitting.append(name)
     fitting.sort(key=lambda name: -found[name].size)
     for words in _ROLES[role]:
         for name in fitting:
@@ -160,13 +156,6 @@ def _fitting_variable(path: Path, role: str, found: Mapping[str, np.ndarray], ch
     if len(fitting) > 1 and role != "intensity":
         raise ValueError(f"{path}: expected one variable for {role}, it may be any of {', '.join(fitting)}")
     return fitting[0] if fitting and role != "intensity" else None
-
-
-def _fits(role: str, array: np.ndarray, size: tuple[int, ...] | None) -> bool:
-    """Return whether an array may be what a role asks for beside an intensity image of a size."""
-    if role == "intensity":
-        return min(array.shape[:2]) >= _SMALLEST and (array.ndim == 2 or array.shape[2:] == (3,))
-    return array.shape == size and ((array > 0).mean() < _SPARSE) == (role == "samples")
 
 
 def _picture(path: Path, name: str, array: np.ndarray) -> Tensor:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dsr.geometry.camera import Camera
+from dsr.synthetic import Rendering
 from dsr.synthetic.procedural.furniture import arched_wall, blinds, column, shelf, table
 from dsr.synthetic.procedural.materials import Body, SceneBuilder
 from dsr.synthetic.procedural.organic import branches, creature, figure, pebble, plant
@@ -22,7 +23,6 @@ from dsr.synthetic.procedural.props import backdrop, fill_room, random_object, s
 from dsr.synthetic.procedural.reliefs import RELIEFS, blanket, crumple, curtain, folds, ground, relief
 from dsr.synthetic.procedural.shape import box, frustum, merge, place_on_ground, prism, random_rotation, random_solid
 from dsr.synthetic.raycast import rotation_about
-from dsr.synthetic.rendering import Rendering
 
 PROCEDURAL_VERSION = 1  # version of the scenes; it has to be increased whenever an image changes
 _PREVIEW_SIZE = 64
