@@ -1,7 +1,5 @@
 """``dataset=arkitscenes``: a tablet's lidar at a ratio of 7.5, with a laser scanner's depth as the truth.
 
-``downsampling=measured scale=native`` takes the lidar's maps as the input.
-
 Baruch et al., "ARKitScenes: A Diverse Real-World Dataset for 3D Indoor Scene Understanding Using Mobile RGB-D Data",
 NeurIPS Datasets and Benchmarks 2021; DATA.md and the READMEs of github.com/apple/ARKitScenes.
 
@@ -87,21 +85,15 @@ def load_frame(
     height, width = _SIZE
     camera = Camera.from_fov(ASSUMED_FOV, width, height)
     if intrinsics_path is not None:
-        camera = read_intrinsics(intrinsics_path)
+        width_given, height_given, *intrinsics = read_numbers(intrinsics_path, 6).tolist()  # pixel centres at integers
+        if (height_given, width_given) != _SIZE:
+            came = f"{height_given:g} x {width_given:g}"
+            raise ValueError(f"{intrinsics_path}: expected a camera of 1440 x 1920 pixels, got {came}")
+        camera = given_camera(intrinsics, _SIZE, intrinsics_path)
     return Scene(dataset, name, rgb, camera, depth, {width / _SIZE_LR[1]: measured})
 
 
-def read_intrinsics(path: Path) -> Camera:
-    """Return the camera of a ``.pincam`` file, of 1920 x 1440 pixels with their centres at integers."""
-    width, height, *intrinsics = read_numbers(path, 6).tolist()
-    if (height, width) != _SIZE:
-        raise ValueError(f"{path}: expected a camera of 1440 x 1920 pixels, got {height:g} x {width:g}")
-    return given_camera(intrinsics, _SIZE, path)
-
-
 NOTE = f"there is no .pincam file: {ASSUMED_FOV:g} degrees of horizontal view are assumed"
-
-
 DETECTED = ((find_frames, load_frame, "arkitscenes"),)
 
 

@@ -4,7 +4,7 @@ Sajjan et al., "ClearGrasp: 3D Shape Estimation of Transparent Objects for Manip
 samples are in github.com/Shreeyak/cleargrasp (Apache 2.0).
 
 ``cleargrasp`` has captures of a RealSense at 1280 x 720, with their depth as the measured map, and of the same scene
-with painted twins in the objects' places, whose depth is the truth: ``downsampling=measured scale=1``.
+with painted twins in the objects' places, whose depth is the truth.
 
     real-val/d435/000000080-transparent-rgb-img.jpg      000000080-transparent-depth-img.exr   metres, 0 or NaN = hole
     real-val/d435/000000080-opaque-depth-img.exr         000000080-mask.png                    not 0: the objects

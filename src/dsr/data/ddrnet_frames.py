@@ -1,7 +1,7 @@
 """``dataset=ddrnet``: a person before a structured-light camera, at the photo's own size, with fused geometry as truth.
 
-``downsampling=measured scale=1`` takes the sensor's maps as the input. Yan et al., "DDRNet: Depth Map Denoising and
-Refinement for Consumer Depth Cameras Using Cascaded CNNs", ECCV 2018; github.com/neycyanshi/DDRNet.
+Yan et al., "DDRNet: Depth Map Denoising and Refinement for Consumer Depth Cameras Using Cascaded CNNs", ECCV 2018;
+github.com/neycyanshi/DDRNet.
 
     GROUP/color_map/frame_000001.png            the photo, 640 x 480
     GROUP/depth_map/frame_000001.png            the sensor's depth, registered to the photo, 16 bits, mm, 0 = hole

@@ -49,15 +49,12 @@ def _stereo(place: Path, *, itself: bool) -> Iterator[tuple[str, Loader]]:
     """Yield the Middlebury scenes directly below a folder, and the one that the folder is."""
     for name, record in middlebury.records_2014(place, "middlebury").items():
         yield name, record.load
-    for name, files in middlebury.find_levels(place).items():
-        yield name, _levels(name, files)
+    levels = middlebury.find_levels(place)
     if itself and (place / "calib.txt").is_file():
         yield place.name, functools.partial(middlebury.load_2014, place, "middlebury", place.name)
     if itself and any((place / photo).is_file() for photo in _YEARS):
         name = place.resolve().name.casefold()
-        yield name, _levels(name, middlebury.find_levels(place.resolve().parent)[name])
-
-
-def _levels(name: str, files: middlebury.Files) -> Loader:
-    year = _YEARS.get(files.photo.name, 2005)
-    return functools.partial(middlebury.load_levels, files, f"middlebury{year}", name, year)
+        levels[name] = middlebury.find_levels(place.resolve().parent)[name]
+    for name, files in levels.items():
+        year = _YEARS.get(files.photo.name, 2005)
+        yield name, functools.partial(middlebury.load_levels, files, f"middlebury{year}", name, year)

@@ -73,8 +73,6 @@ def load_frame(rgb_path: Path, levels_path: Path, dataset: str, name: str) -> Sc
 
 
 NOTE = "depth is not metric: the camera is invented, and levels are read as disparity"
-
-
 DETECTED = tuple((functools.partial(find_frames, dataset=each), load_frame, each) for each in BENCHMARKS)
 
 

@@ -1,8 +1,5 @@
 """``dataset=hammer``: tables with glass, metal and other things before three depth cameras, with a scanner's truth.
 
-``downsampling=measured scale=1`` takes the maps of the camera ``dataset.sensor`` as the input: ``d435``, active stereo,
-``tof``, indirect time of flight, or ``l515``, direct time of flight.
-
 Jung et al., "On the Importance of Accurate Geometry Data for Dense 3D Vision Tasks", CVPR 2023, the HAMMER data set;
 README.md of github.com/Junggy/HAMMER-dataset, which states no licence. Scenes 2 to 11 are to train on, 12 to 14 to
 test. As the archive ``_dataset_processed.zip`` has them, by the loaders of others who use it:
@@ -12,8 +9,7 @@ test. As the archive ``_dataset_processed.zip`` has them, by the loaders of othe
     scene12_traj1_1/polarization/depth_d435/000000.png     the camera's depth, warped into the photo, mm, 0 = hole
     scene12_traj1_1/polarization/intrinsics.txt            3 x 3, taken as it is: pixel centres at integers
 
-likewise ``depth_tof`` and ``depth_l515``. The sequences ``scene12_traj1_naked_1`` have the same views without the
-objects.
+likewise ``depth_tof`` and ``depth_l515``. Sequences such as ``scene12_traj1_naked_1`` lack the objects.
 """
 
 from __future__ import annotations

@@ -81,8 +81,6 @@ FRAMES = MappingProxyType(
         "displays": "office_room_traj2/0300",
     }
 )
-
-
 DETECTED = ((find_frames, load_frame, "icl"),)
 
 

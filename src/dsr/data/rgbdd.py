@@ -1,7 +1,6 @@
 """``dataset=rgbdd`` and ``dataset=rgbdd_real``: a photo and two time-of-flight sensors (He et al., CVPR 2021).
 
-``rgbdd`` has the industrial sensor's depth to downsample, ``rgbdd_real`` that of a phone beside it, which
-``downsampling=measured scale=native`` takes as the input, at a ratio of 2.667.
+``rgbdd`` has the industrial sensor's depth to downsample, ``rgbdd_real`` that of a phone beside it.
 
 He et al., "Towards Fast and Accurate Real-World Depth Super-Resolution: Benchmark Dataset and Baseline", CVPR 2021;
 github.com/lingzhi96/RGB-D-D-Dataset. As its owners hand it out:

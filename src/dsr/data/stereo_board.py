@@ -1,7 +1,5 @@
 """``dataset=stereo_board``: a stereo camera before a board, which is an exact plane.
 
-``downsampling=measured scale=1`` takes the camera's maps as the input.
-
 Five pairs of a RealSense that came with the code of Kienle and Petri, "Multi-Object Self-Supervised Depth Denoising",
 arXiv 2305.05778, MIT licence; ``resources/images/uncalibrated/realsense`` in the commit c73b356 of
 github.com/alr-internship/self-supervised-depth-denoising:

@@ -67,8 +67,9 @@ def load_frame(
     folder: Path, dataset: str, name: str, *, refined: bool = False, intrinsics: Intrinsics | None = None
 ) -> Scene:
     """Return the scene of a folder; ``intrinsics`` are for one without ``intrinsics.txt``."""
-    rgb_path, depth_path, *matrix = frame_files(folder, refined=refined)
-    given = matrix[0] if matrix else intrinsics
+    rgb_path, depth_path = _only(folder / "image"), _only(folder / ("depth_bfx" if refined else "depth"))
+    matrix = folder / "intrinsics.txt"
+    given = matrix if matrix.is_file() else intrinsics
     if given is None:
         raise ValueError(f"{folder}: expected intrinsics.txt, or intrinsics=(fx, fy, cx, cy) instead, got neither")
     return load_pair(rgb_path, depth_path, dataset, name, given)
@@ -82,13 +83,6 @@ def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str, intrins
     if isinstance(intrinsics, Path):
         return Scene(dataset, name, rgb, read_intrinsics(intrinsics, size), depth)
     return Scene(dataset, name, rgb, given_camera(intrinsics, size), depth)
-
-
-def frame_files(folder: Path, *, refined: bool = False) -> tuple[Path, ...]:
-    """Return the files of a scene folder that are read: colour, depth, and intrinsics.txt where there is one."""
-    matrix = folder / "intrinsics.txt"
-    depth = "depth_bfx" if refined else "depth"
-    return (_only(folder / "image"), _only(folder / depth), *([matrix] if matrix.is_file() else []))
 
 
 def _only(folder: Path) -> Path:
@@ -116,8 +110,6 @@ FRAMES = MappingProxyType(
         "xtion_3": "xtion/sun3ddata/brown_bm_2/brown_bm_2",
     }
 )
-
-
 DETECTED = ((find_frames, load_frame, "sunrgbd"),)
 
 

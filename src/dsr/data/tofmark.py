@@ -1,6 +1,6 @@
 """``dataset=tofmark``: samples of a time-of-flight sensor and a photo (Ferstl et al., ICCV 2013).
 
-Voynov et al. 2019 use Books, Devil and Shark with the maps of the real sensor as the input: ``downsampling=measured``.
+Voynov et al. 2019 use Books, Devil and Shark with the maps of the real sensor as the input.
 
     benchmarking_dataset_NAME.mat     intensity, true depth, and the sensor's samples projected into the intensity image
     NAME.bmp, NAME_depth.bmp          intensity and samples in 8 bits; 0 = no sample, which 97.5 % of the pixels are
@@ -190,8 +190,6 @@ def _listed(found: Mapping[str, np.ndarray]) -> str:
 
 SCENES = ("books", "devil", "shark")
 ESTIMATED = (549.2, 549.2, 375.2, 334.3)  # fx, fy, cx, cy in pixels of the 610 x 810 photos
-
-
 DETECTED = ((find_frames, load_frame, "tofmark"),)
 
 
