@@ -54,10 +54,11 @@ def test_frames_are_found_from_a_directory_above_and_need_all_their_files(kind, 
 
 
 def test_fingerprint_changes_with_every_file(kind, tmp_path):
-    prints = {opened(kind, tmp_path).fingerprint(kind.name)}
+    data = opened(kind, tmp_path)
+    prints = {data.fingerprint(kind.name)}
     for path in kind.files:
         (tmp_path / path).write_bytes(b"other")
-        prints.add(opened(kind, tmp_path).fingerprint(kind.name))
+        prints.add(data.fingerprint(kind.name))
     assert len(prints) == 1 + len(kind.files)
 
 
