@@ -1,5 +1,7 @@
 """Data sets, of files of our own: values, names, splits, and every damage named."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from data_set_files import SETS, npy, opened, ramp, write_frame
@@ -9,6 +11,7 @@ from small_files import written
 
 from dsr.data import hammer
 from dsr.data.ddrnet_frames import DDRNetFrames
+from dsr.data.detection import find_scenes
 from dsr.data.hammer import Hammer
 from dsr.data.rgbdd import RGBDD, find_frames
 from dsr.data.sintel import Sintel
@@ -84,6 +87,25 @@ def test_map_of_holes_is_refused(tmp_path, capfd, name):
     path = written(tmp_path / list(kind.files)[-1], kind.holes)
     data = opened(kind, tmp_path)
     assert "expected at least one known" in refused(lambda: data.load(kind.name), path, capfd)
+
+
+TOGETHER = ("lu", "middlebury8", "nyu", "rgbdd in circulation", "ddrnet")
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_benchmarks_are_detected_each_once_and_by_its_own_reader(tmp_path, together):
+    for name in TOGETHER:
+        for path, content in SETS["lu" if name == "middlebury8" else name].files.items():
+            file = Path(path.removeprefix("Lu/").removeprefix("DCTNet/").removeprefix("20170907/group1/"))
+            if name == "middlebury8":
+                file = Path(str(file).replace("RGBD_", "Middlebury_").replace("ouput", "output"))
+            written(tmp_path / ("" if together else name) / file, content)
+    scenes = [load() for _, load in find_scenes(tmp_path)]
+    assert sorted(scene.dataset for scene in scenes) == sorted(
+        name.removesuffix(" in circulation") for name in TOGETHER
+    )
+    units = {scene.dataset: scene.unit.name for scene in scenes}
+    assert {name for name, unit in units.items() if unit == "levels"} == {"lu", "middlebury8"}
 
 
 def test_scenes_12_to_14_of_hammer_are_to_test_on_and_naked_ones_are_left_out(tmp_path):
