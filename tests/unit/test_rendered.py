@@ -96,18 +96,12 @@ def test_unwritable_cache_is_ignored(tmp_path, monkeypatch, calls):
 
 
 def test_cache_directory_is_dsr_cache_or_the_users(monkeypatch, tmp_path):
-    monkeypatch.setenv("DSR_CACHE", str(tmp_path / "mine"))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    assert cache_directory() == tmp_path / "mine"
-    monkeypatch.delenv("DSR_CACHE")
-    assert cache_directory() == tmp_path / "xdg" / "dsr"
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    assert cache_directory() == tmp_path / "home" / ".cache" / "dsr"
-
-
-def test_tests_do_not_use_the_users_cache(dsr_cache):
-    assert cache_directory() == dsr_cache
+    places = {"DSR_CACHE": tmp_path / "mine", "XDG_CACHE_HOME": tmp_path / "xdg", "HOME": tmp_path / "home"}
+    for name, place in places.items():
+        monkeypatch.setenv(name, str(place))
+    for name, cache in (("DSR_CACHE", "mine"), ("XDG_CACHE_HOME", "xdg/dsr"), ("HOME", "home/.cache/dsr")):
+        assert cache_directory() == tmp_path / cache
+        monkeypatch.delenv(name)
 
 
 @pytest.fixture
@@ -122,16 +116,12 @@ def lucy(tmp_path):
     return folder
 
 
-def test_lucy_replaces_the_statue_where_available(lucy):
+def test_lucy_replaces_the_statue_where_available_and_her_fingerprint_follows_her_files(lucy):
     source = SimGeo(str(lucy.parent), size=SIZE)
     assert source.scenes() == [*SCENES[:5], "lucy"]
     scene = source.load("lucy")
     assert (scene.dataset, scene.name) == ("simgeo", "lucy")
     assert bool((scene.depth == 2.5).all())
-
-
-def test_fingerprint_of_lucy_follows_her_files_and_that_of_renderings_their_size(lucy):
-    source = SimGeo(str(lucy.parent), size=SIZE)
     before, cube = source.fingerprint("lucy"), source.fingerprint(NAME)
     np.save(lucy / "depth.npy", np.full((4, 8), 2.0))
     assert source.fingerprint("lucy") != before
@@ -144,17 +134,8 @@ def test_statue_stands_in_for_a_missing_lucy(tmp_path, root):
     source = SimGeo(None if root is None else str(tmp_path / root), size=SIZE)
     assert source.scenes() == list(SCENES)
     assert SCENES[5] == "statue"
-
-
-def test_chosen_scenes_alone_are_available_and_an_unknown_one_is_refused(lucy):
-    assert SimGeo(None, ["statue"], SIZE).scenes() == ["statue"]
     with pytest.raises(ValueError, match=r"^scenes: 'lucy' is not there; expected some of .*statue"):
         SimGeo(None, ["lucy"], SIZE)
-
-
-def test_size_below_32_is_refused():
-    with pytest.raises(ValueError, match=r"^size: expected at least 32 pixels, got 31"):
-        SimGeo(size=31)
 
 
 def test_procedural_scene_is_the_rendering_of_its_number_made_once(cache, monkeypatch):
@@ -172,6 +153,11 @@ def test_preparing_renders_what_is_missing_and_names_every_scene(cache):
     assert sorted(source.prepare(source.scenes())) == ["00000", "00001", "00002"]
     assert len(list(cache.rglob("*.npz"))) == 3
     assert list(source.prepare(["00002", "00000"])) == ["00002", "00000"]
+    others = [Procedural(count=1, size=SMALL, seed=1), Procedural(count=1, size=64)]  # share no scene with it
+    for other in others:
+        other.load("00000")
+    assert len(list(cache.rglob("*.npz"))) == 5
+    assert len({each.fingerprint("00000") for each in (source, *others)}) == 3
 
 
 @pytest.mark.slow
@@ -194,16 +180,15 @@ def test_scene_of_a_killed_worker_is_rendered_by_another(cache, monkeypatch):
     assert len(list(cache.rglob("*.npz"))) == 3
 
 
-@pytest.mark.slow
-def test_seeds_and_sizes_do_not_share_scenes(cache):
-    sources = [Procedural(count=1, size=SMALL), Procedural(count=1, size=SMALL, seed=1), Procedural(count=1, size=64)]
-    for source in sources:
-        source.load("00000")
-    assert len(list(cache.rglob("*.npz"))) == 3
-    assert len({source.fingerprint("00000") for source in sources}) == 3
-
-
-@pytest.mark.parametrize("wrong", [{"count": 0}, {"size": 16}, {"seed": -1}])
-def test_values_out_of_range_are_refused(wrong):
-    with pytest.raises(ValueError, match="dataset: expected count at least 1, size at least 32, seed at least 0"):
-        Procedural(**wrong)
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: SimGeo(size=31), "size: expected at least 32 pixels, got 31"),
+        (lambda: Procedural(count=0), "dataset: expected count at least 1, .* got 0, 512, 0"),
+        (lambda: Procedural(size=16), "dataset: expected .* size at least 32, .* got 200, 16, 0"),
+        (lambda: Procedural(seed=-1), "dataset: expected .* seed at least 0; got 200, 512, -1"),
+    ],
+)
+def test_values_out_of_range_are_refused(make, message):
+    with pytest.raises(ValueError, match=f"^{message}"):
+        make()

@@ -93,6 +93,12 @@ def files(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 
+def written(*scenes):
+    """Return the files of a run with predictions of these scenes."""
+    places = [f"{place}/{scene}.npz" for place in ("predictions", "scenes") for scene in scenes]
+    return [*places, "scores.csv", "summary.json"]
+
+
 def rows(folder):
     with (folder / "scores.csv").open(newline="") as file:
         return list(csv.DictReader(file))
@@ -108,21 +114,14 @@ def replace_depth(path, depth):
     np.savez(path, depth=depth, config=config, seconds=1.0)
 
 
-def test_run_writes_predictions_scores_and_a_summary_and_nothing_else(tmp_path):
+def test_run_writes_predictions_in_metres_with_their_config_scores_and_a_summary_and_nothing_else(tmp_path):
     run(toy_study(tmp_path))
-    assert files(tmp_path) == [
-        *("predictions/a.npz", "predictions/b.npz"),
-        *("scenes/a.npz", "scenes/b.npz", "scores.csv", "summary.json"),
-    ]
+    assert files(tmp_path) == written("a", "b")
     content = summary(tmp_path)
     assert (content["dataset"], content["method"], content["scale"], content["seed"]) == ("toy", "toy_method", 2, 7)
     assert (content["scenes"], content["predicted"], content["reused"]) == (2, ["a", "b"], [])
     assert (content["failures"], content["without_truth"], list(content["seconds"])) == ({}, [], ["a", "b"])
     assert len(set(content["truths"].values())) == 2
-
-
-def test_prediction_is_in_metres_with_its_config(tmp_path):
-    run(toy_study(tmp_path))
     with np.load(tmp_path / "predictions" / "a.npz") as kept:
         depth, config = kept["depth"], json.loads(str(kept["config"]))
     blocks = RAMP[0].numpy().reshape(8, 2, 8, 2).mean(axis=(1, 3))
@@ -176,9 +175,11 @@ def test_summary_and_pictures_have_the_worst_of_four_lights(tmp_path):
     assert torch.equal(depth, load_prediction(tmp_path / "predictions" / "a.npz"))
 
 
-def test_second_run_reuses_predictions_without_calling_the_method(tmp_path):
+def test_second_run_reuses_predictions_without_calling_the_method_and_stores_a_missing_sample_again(tmp_path):
     _, first = run(toy_study(tmp_path))
     before = {name: (tmp_path / name).stat().st_mtime_ns for name in files(tmp_path) if name.startswith("pred")}
+    sample = DepthSample.load(tmp_path / "scenes" / "a.npz")
+    (tmp_path / "scenes" / "a.npz").unlink()
     method = ToyMethod()
     results, second = run(toy_study(tmp_path, method=method))
     assert method.calls == []
@@ -186,6 +187,7 @@ def test_second_run_reuses_predictions_without_calling_the_method(tmp_path):
     assert summary(tmp_path)["reused"] == ["a", "b"]
     assert before == {name: (tmp_path / name).stat().st_mtime_ns for name in before}
     assert first.equals(second)
+    assert torch.equal(DepthSample.load(tmp_path / "scenes" / "a.npz").depth_lr, sample.depth_lr)
 
 
 def test_overwrite_makes_every_prediction_anew_and_replaces_it_atomically(tmp_path):
@@ -246,10 +248,7 @@ def test_bad_scene_does_not_lose_the_others_results(tmp_path, failure, message):
     assert results["bad"].failure == message
     assert scores["scene"].unique().tolist() == ["a", "c"]
     assert summary(tmp_path)["failures"] == {"bad": message}
-    assert files(tmp_path) == [
-        *("predictions/a.npz", "predictions/c.npz"),
-        *("scenes/a.npz", "scenes/c.npz", "scores.csv", "summary.json"),
-    ]
+    assert files(tmp_path) == written("a", "c")
 
 
 @pytest.mark.parametrize(
@@ -288,12 +287,18 @@ def test_picture_that_cannot_be_drawn_fails_its_scene_and_keeps_its_scores(tmp_p
     assert {row["scene"] for row in rows(tmp_path)} == {"a", "b"}
 
 
-def test_stored_prediction_of_the_wrong_shape_is_not_scored(tmp_path):
-    study = toy_study(tmp_path)
+@pytest.mark.parametrize("damage", ["prediction", "sample"])
+def test_stored_prediction_of_the_wrong_shape_or_beside_a_damaged_sample_is_not_scored(tmp_path, damage):
+    study, sample = toy_study(tmp_path), tmp_path / "scenes" / "a.npz"
     run(study)
-    replace_depth(tmp_path / "predictions" / "a.npz", np.ones((3, 5)))
+    if damage == "prediction":
+        replace_depth(tmp_path / "predictions" / "a.npz", np.ones((3, 5)))
+        message = "expected a prediction of shape (1, 16, 16), got (1, 3, 5)"
+    else:
+        sample.write_bytes(sample.read_bytes()[:50])
+        message = f"{sample}: expected the sample of a scene, got a damaged or foreign file"
     results, scores = run(study)
-    assert "expected a prediction of shape (1, 16, 16), got (1, 3, 5)" in results["a"].failure
+    assert message in results["a"].failure
     assert scores["scene"].unique().tolist() == ["b"]
 
 
@@ -320,17 +325,22 @@ def test_cropped_scene_is_noted(tmp_path):
     assert summary(tmp_path)["notes"] == {"odd": ["cropped from 16 x 17 to 16 x 16, which 2 divides"]}
 
 
+def half_written(error):
+    """Return a writer of arrays that fails after half a file."""
+
+    def write(path, **arrays):
+        path.write_bytes(b"half a file")
+        raise error
+
+    return write
+
+
 def test_interruption_keeps_the_finished_scene_and_leaves_no_temporary_file(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         run(toy_study(tmp_path, method=ToyMethod(b=KeyboardInterrupt())))
     assert files(tmp_path) == ["predictions/a.npz", "scenes/a.npz"]
-
-    def cut(path, **arrays):
-        path.write_bytes(b"half a file")
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(np, "savez_compressed", cut)
+        patch.setattr(np, "savez_compressed", half_written(KeyboardInterrupt()))
         with pytest.raises(KeyboardInterrupt):
             run(toy_study(tmp_path))
     assert [name for name in files(tmp_path) if name.startswith("pred")] == ["predictions/a.npz"]
@@ -343,12 +353,7 @@ def test_interruption_keeps_the_finished_scene_and_leaves_no_temporary_file(tmp_
 def test_full_disk_ends_the_pass_and_keeps_the_former_prediction(tmp_path, monkeypatch):
     run(toy_study(tmp_path))
     before = (tmp_path / "predictions" / "a.npz").read_bytes()
-
-    def full(path, **arrays):
-        path.write_bytes(b"half a file")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(np, "savez_compressed", full)
+    monkeypatch.setattr(np, "savez_compressed", half_written(OSError(28, "No space left on device")))
     with pytest.raises(FullDiskError, match=r"a\.npz: expected space to write the file"):
         run(toy_study(tmp_path), overwrite=True)
     assert (tmp_path / "predictions" / "a.npz").read_bytes() == before
@@ -403,23 +408,3 @@ def test_scene_without_a_solution_is_a_result_and_no_failure_and_its_earlier_pre
     assert content["failures"] == {}
     assert set(scores["scene"]) == {"a"}
     assert not (tmp_path / "predictions" / "b.npz").exists()
-
-
-def test_sample_that_is_missing_beside_its_prediction_is_stored_again(tmp_path):
-    run(toy_study(tmp_path))
-    before = DepthSample.load(tmp_path / "scenes" / "a.npz")
-    (tmp_path / "scenes" / "a.npz").unlink()
-    method = ToyMethod()
-    _, scores = run(toy_study(tmp_path, method=method))
-    assert (method.calls, summary(tmp_path)["reused"]) == ([], ["a", "b"])
-    assert torch.equal(DepthSample.load(tmp_path / "scenes" / "a.npz").depth_lr, before.depth_lr)
-    assert set(scores["scene"]) == {"a", "b"}
-
-
-def test_damaged_sample_is_named_and_the_other_scenes_are_kept(tmp_path):
-    run(toy_study(tmp_path))
-    path = tmp_path / "scenes" / "a.npz"
-    path.write_bytes(path.read_bytes()[:50])
-    results, scores = run(toy_study(tmp_path))
-    assert results["a"].failure == f"{path}: expected the sample of a scene, got a damaged or foreign file"
-    assert set(scores["scene"]) == {"b"}
