@@ -162,28 +162,25 @@ def test_sphere_is_hit_as_by_the_quadratic_formula_up_to_its_silhouette():
     assert outside == np.inf
 
 
-def test_cylinder_shows_its_side_and_its_cap_at_the_right_depths():
-    upright = Cylinder(np.array([0.0, 0.0, 3.0]), np.eye(3), 0.4, 0.7)
-    assert upright.intersect(EYE, AHEAD)[0] == pytest.approx(2.6, abs=1e-15)
-    end_on = Cylinder(np.array([0.0, 0.0, 3.0]), np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]), 0.4, 0.7)
-    hit = end_on.intersect(EYE, AHEAD)
-    assert hit[0] == pytest.approx(2.3, abs=1e-15)
-    np.testing.assert_allclose(end_on.normal(hit * AHEAD)[:, 0], [0, 0, -1], atol=1e-15)
+AT_3, HALF = np.array([0.0, 0.0, 3.0]), math.sqrt(0.5)
+UPRIGHT, END_ON = np.eye(3), np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+ON_EDGE = np.array([[HALF, 0, HALF], [0, 1, 0], [-HALF, 0, HALF]])
 
 
-def test_box_on_edge_shows_its_edge_at_the_half_diagonal():
-    s = math.sqrt(0.5)
-    box = Box(np.array([0.0, 0.0, 3.0]), np.array([[s, 0, s], [0, 1, 0], [-s, 0, s]]), np.full(3, 0.4))
-    assert box.intersect(EYE, AHEAD)[0] == pytest.approx(3 - 0.4 * math.sqrt(2), abs=1e-14)
-
-
-def test_objects_behind_the_camera_are_not_hit():
-    for surface in (
-        Sphere(np.array([0.0, 0.0, -3.0]), np.eye(3), 0.5),
-        Box(np.array([0.0, 0.0, -3.0]), np.eye(3), np.full(3, 0.5)),
-        Plane(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, -1.0])),
-    ):
-        assert surface.intersect(EYE, AHEAD)[0] == np.inf
+@pytest.mark.parametrize(
+    ("surface", "depth"),
+    [
+        (Cylinder(AT_3, UPRIGHT, 0.4, 0.7), 2.6), (Cylinder(AT_3, END_ON, 0.4, 0.7), 2.3),
+        (Box(AT_3, ON_EDGE, np.full(3, 0.4)), 3 - 0.4 * math.sqrt(2)), (Sphere(-AT_3, np.eye(3), 0.5), np.inf),
+        (Box(-AT_3, np.eye(3), np.full(3, 0.4)), np.inf),
+        (Plane(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, -1.0])), np.inf),
+    ],
+)  # fmt: skip
+def test_ray_ahead_hits_what_is_in_front_of_the_camera_at_its_depth(surface, depth):
+    hit = surface.intersect(EYE, AHEAD)
+    assert hit[0] == pytest.approx(depth, abs=1e-14)
+    if isinstance(surface, Cylinder):
+        np.testing.assert_allclose(surface.normal(hit * AHEAD)[:, 0], [0, 0, -1], atol=1e-15)
 
 
 def test_implicit_sphere_agrees_with_the_exact_one():
