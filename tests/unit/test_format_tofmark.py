@@ -52,12 +52,12 @@ def pictures(tmp_path):
 
 
 def test_range_of_the_caller_converts_levels_to_metres_and_0_is_no_sample(pictures):
-    scene = load_frame(*pictures, "tofmark", "books", intrinsics=INTRINSICS, depth_range=(0.5, 3.04), factors=(1, 4))
+    scene = load_frame(*pictures, "tofmark", "books", intrinsics=INTRINSICS, depth_range=(0.5, 3.04))
     assert scene.depth is None
-    samples = scene.measured[1][0]
-    assert samples[[1, 1, 7], [2, 8, 2]].tolist() == pytest.approx([0.5, 3.04, 0.5 + 60 * 0.01])
-    assert samples.isfinite().sum().item() == 28
     assert scene.measured[4].shape == (1, 5, 10)
+    samples = scene.measured[4][0]  # a sample in 28 of the blocks
+    assert samples[[0, 0, 1], [0, 2, 0]].tolist() == pytest.approx([0.5, 3.04, 0.5 + 60 * 0.01])
+    assert samples.isfinite().sum().item() == 28
     assert (scene.camera.height, scene.camera.width, scene.camera.cy) == (*SIZE, 9.5)
     np.testing.assert_array_equal((scene.rgb * 255).round()[2], GREY)
 

@@ -36,6 +36,7 @@ class Procedural(SceneSource):
             )
         expect_room_for(size)
         self._size, self._seed = size, seed
+        self._series = f"procedural-v{PROCEDURAL_VERSION}-{seed}-{size}"
         self._scenes = [f"{index:05d}" for index in range(count)]
 
     def load(self, scene: str) -> Scene:
@@ -44,7 +45,7 @@ class Procedural(SceneSource):
 
     def fingerprint(self, scene: str) -> str:
         """Return the version, seed, size and number that determine the scene."""
-        return f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}-{scene}"
+        return f"{self._series}-{scene}"
 
     def prepare(self, scenes: Sequence[str], say: Callable[[str], None] = SILENT.say) -> Iterable[str]:
         """Render scenes that are not in the cache, and yield the name of each that is ready.
@@ -71,7 +72,7 @@ class Procedural(SceneSource):
         return load_or_render(self._path(scene), lambda: render_random_scene(self._seed, int(scene), self._size))
 
     def _path(self, scene: str) -> Path:
-        return Path(f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}", f"{scene}.npz")
+        return Path(self._series, f"{scene}.npz")
 
 
 class SimGeo(SceneSource):

@@ -102,19 +102,15 @@ class SceneSubset(SceneSource):
         return self._source.fingerprint(scene)
 
 
-class _Outside(SceneSource):
-    """A data set of others, which has members of :class:`SceneSource` and does not derive from it."""
-
-    def __init__(self, made: Any) -> None:
-        members = ("name", "evaluation", "regions", "soft_edges", "scenes", "load", "fingerprint", "content", "prepare")
-        for member in members:
-            if hasattr(made, member):
-                setattr(self, member, getattr(made, member))
-
-
 def as_source(made: Any) -> SceneSource:
     """Return what a node of the configuration makes as a data set, with the defaults of what it leaves out."""
-    return made if isinstance(made, SceneSource) else _Outside(made)
+    if isinstance(made, SceneSource):
+        return made
+    source = SceneSource()
+    for member in ("name", "evaluation", *vars(SceneSource)):
+        if not member.startswith("_") and hasattr(made, member):
+            setattr(source, member, getattr(made, member))
+    return source
 
 
 def select_scenes(available: Sequence[str], wanted: SceneSelection) -> list[str]:

@@ -64,7 +64,6 @@ def load_frame(
     intrinsics: tuple[float, float, float, float] | None = None,
     depth_range: tuple[float, float] | None = None,
     variables: Mapping[str, str] | None = None,
-    factors: Sequence[int] = FACTORS,
 ) -> Scene:
     """Return one scene, with the samples as measured low-resolution maps.
 
@@ -92,7 +91,7 @@ def load_frame(
     camera = given_camera(intrinsics, (rgb.shape[1], rgb.shape[2]))
     measured: dict[float, Tensor] = {}
     if samples is not None:
-        measured = {factor: block_means(samples, factor) for factor in factors}
+        measured = {factor: block_means(samples, factor) for factor in FACTORS}
     return Scene(dataset, name, rgb, camera, depth, measured)
 
 
@@ -128,8 +127,6 @@ def read_matrices(
 
 def block_means(depth: Tensor, factor: int) -> Tensor:
     """Return the mean of 1/z in each ``factor`` x ``factor`` block of a depth map (1, H, W), as depth."""
-    if not 1 <= factor <= min(depth.shape[1:]):
-        raise ValueError(f"factors: expected from 1 to {min(depth.shape[1:])}, got {factor}")
     height, width = depth.shape[1] // factor, depth.shape[2] // factor
     inverse = depth[:, : height * factor, : width * factor].reciprocal().reshape(1, height, factor, width, factor)
     return inverse.nanmean(dim=(2, 4)).reciprocal()
