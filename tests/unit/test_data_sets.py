@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from data_set_files import SETS, npy, opened, ramp, write_frame
+from data_set_files import SETS, exr, npy, opened, ramp, write_frame
 from refusals import refused
 from small_files import encoded_png as png
 from small_files import written
@@ -81,12 +81,19 @@ def test_damaged_or_foreign_file_is_refused_in_one_line_that_names_it(kind, tmp_
         (tmp_path / path).write_bytes(right)
 
 
-@pytest.mark.parametrize("name", [name for name, kind in SETS.items() if kind.holes])
-def test_map_of_holes_is_refused(tmp_path, capfd, name):
+NEGATIVE = {"cleargrasp": exr(-1.0 - np.ones((36, 64))), "tartanair": npy(-np.ones((480, 640), np.float32))}
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [*((name, kind.holes, "expected at least one known") for name, kind in SETS.items() if kind.holes),
+     *((name, content, "expected positive depth") for name, content in NEGATIVE.items())],
+)  # fmt: skip
+def test_map_of_holes_or_negative_depth_is_refused(tmp_path, capfd, name, content, message):
     kind = write_frame(name, tmp_path)
-    path = written(tmp_path / list(kind.files)[-1], kind.holes)
+    path = written(tmp_path / list(kind.files)[-1], content)
     data = opened(kind, tmp_path)
-    assert "expected at least one known" in refused(lambda: data.load(kind.name), path, capfd)
+    assert message in refused(lambda: data.load(kind.name), path, capfd)
 
 
 TOGETHER = ("lu", "middlebury8", "nyu", "rgbdd in circulation", "ddrnet")

@@ -360,11 +360,9 @@ def test_verification_names_files_of_another_size_and_missing_ones(server, tmp_p
 
 def test_files_from_elsewhere_are_recorded_as_they_are(server, tmp_path):
     item = picture(server)
-    (tmp_path / "set").mkdir()
-    (tmp_path / "set/a.png").write_bytes(PNG)
+    for name in "abc":
+        written(tmp_path / f"set/{name}.png", PNG)
     assert verified(collection(item), tmp_path) == ([], [f"{tmp_path}/checksums.json: recorded as found: set/a.png"])
-    (tmp_path / "set/b.png").write_bytes(PNG)
-    (tmp_path / "set/c.png").write_bytes(PNG)
     items, watcher = [picture(server, name=f"{name}.png") for name in "bca"], Watcher()
     assert get(items, tmp_path, watcher) == []
     assert watcher.lines == [f"{tmp_path}/checksums.json: recorded as found: set/{name}.png" for name in "bc"]
@@ -375,30 +373,24 @@ def test_files_from_elsewhere_are_recorded_as_they_are(server, tmp_path):
 MANUAL = collection(manual="put *.mat into {folder}", patterns=("*.mat", "*/P*/*.png"))
 
 
-def test_manual_route_names_what_is_missing_and_its_place(tmp_path):
+def test_manual_route_names_what_is_missing_records_once_and_checks_afterwards(tmp_path):
+    folder = tmp_path / "set"
     problems, _ = verified(MANUAL, tmp_path)
-    assert [problem.split(": ")[1] for problem in problems] == [
-        "expected *.mat, there is none",
-        "expected */P*/*.png, there is none",
-    ]
-    for problem in problems:
-        assert problem.startswith(f"{tmp_path / 'set'}: ")
-        assert f"put *.mat into {tmp_path / 'set'}, then `dsr data verify mine`" in problem
-
-
-def test_manual_route_records_once_and_checks_afterwards(tmp_path):
+    for problem, pattern in zip(problems, MANUAL.patterns, strict=True):
+        assert problem.startswith(f"{folder}: expected {pattern}, there is none: put *.mat into {folder}, then")
+        assert "`dsr data verify mine`" in problem
+    assert state(MANUAL, tmp_path) == "manual"
     for name, content in {"set/a.mat": b"MATLAB 5.0", "set/sea/P000/1.png": PNG}.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_bytes(content)
+        written(tmp_path / name, content)
+    assert state(MANUAL, tmp_path) == "complete"
     recorded = f"{tmp_path}/checksums.json: recorded as found: set/a.mat, set/sea/P000/1.png"
     assert verified(MANUAL, tmp_path) == ([], [recorded])
     assert verified(MANUAL, tmp_path) == ([], [])
     (tmp_path / "set/a.mat").write_bytes(b"MATLAB 7.3")
     (tmp_path / "set/sea/P000/1.png").rename(tmp_path / "set/sea/P000/2.png")
-    problems, _ = verified(MANUAL, tmp_path)
-    assert len(problems) == 2
-    assert "set/sea/P000/1.png: expected a file as recorded, there is none" in problems[0]
-    assert f"got {sha256(b'MATLAB 7.3')}" in problems[1]
+    missing, other = verified(MANUAL, tmp_path)[0]
+    assert "set/sea/P000/1.png: expected a file as recorded, there is none" in missing
+    assert f"got {sha256(b'MATLAB 7.3')}" in other
 
 
 def test_collection_state_is_reported(server, tmp_path):
@@ -410,11 +402,6 @@ def test_collection_state_is_reported(server, tmp_path):
     assert state(collection(*items), tmp_path) == "complete"
     (tmp_path / "set/room/rgb/2.png").unlink()
     assert state(collection(*items), tmp_path) == "partial 2 of 3"
-    assert state(MANUAL, tmp_path) == "manual"
-    (tmp_path / "set/sea/P000").mkdir(parents=True)
-    (tmp_path / "set/sea/P000/1.png").write_bytes(PNG)
-    (tmp_path / "set/a.mat").write_bytes(b"MATLAB")
-    assert state(MANUAL, tmp_path) == "complete"
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"a": 3}', '{"a": {"size": "3"}}', '{"a": {"size": 3, "sha256": 5}}'])

@@ -24,12 +24,14 @@ NO_CAMERA = f"no camera is published: {ASSUMED_FOV:g} degrees of horizontal view
 Found = TypeVar("Found")
 
 
-def read_picture(path: Path) -> Tensor:
-    """Return a picture of 8 or 16 bits a channel, (3, H, W) float32 in [0, 1]."""
+def read_picture(path: Path, size: Sequence[int] | None = None) -> Tensor:
+    """Return a picture of 8 or 16 bits a channel, (3, H, W) float32 in [0, 1], perhaps of a given size."""
     pixels = read_pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{path}: expected a picture of 8 or 16 bits a channel, got {pixels.dtype}")
     scaled = pixels[..., ::-1].astype(np.float32) / np.iinfo(pixels.dtype).max
+    if size is not None:
+        expect_size(path, scaled[..., 0], size)
     return torch.from_numpy(np.ascontiguousarray(scaled.transpose(2, 0, 1)))
 
 

@@ -95,10 +95,9 @@ def load_matrices(path: Path, dataset: str, name: str) -> Scene:
 def load_pictures(rgb_path: Path, depth_path: Path, calibration_path: Path, *paths: Path | str | None) -> Scene:
     """Return the scene of pictures; ``paths`` are the files of :data:`_MASKS`, then the names of data set and scene."""
     *mask_paths, dataset, name = paths
-    rgb, depth = read_picture(rgb_path), read_16bit(depth_path)
+    rgb, depth = read_picture(rgb_path, SIZE), read_16bit(depth_path)
     given = {key: path for key, path in zip(_MASKS, mask_paths, strict=True) if isinstance(path, Path)}
     masks = {key: read_levels(path) for key, path in given.items()}
-    expect_size(rgb_path, rgb, SIZE)
     for path, image in ((depth_path, depth), *((given[key], mask) for key, mask in masks.items())):
         expect_size(path, image, SIZE)
     text = read_text(calibration_path)

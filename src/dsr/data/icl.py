@@ -66,9 +66,7 @@ def read_depth(path: Path) -> Tensor:
 
 def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
     """Return one frame at 640 x 480."""
-    rgb = read_picture(rgb_path)
-    expect_size(rgb_path, rgb, _SIZE)
-    return Scene(dataset, name, rgb, CAMERA, read_depth(depth_path))
+    return Scene(dataset, name, read_picture(rgb_path, _SIZE), CAMERA, read_depth(depth_path))
 
 
 FRAMES = MappingProxyType(

@@ -102,8 +102,7 @@ def load_2014(folder: Path, dataset: str, name: str, *, offset: bool = True) -> 
         raise ValueError(f"{path}: expected disparities above {low:g} pixels, got {np.nanmin(values):g}")
     if not offset:
         camera = replace(camera, doffs=0.0)
-    rgb = read_picture(folder / "im0.png")
-    expect_size(folder / "im0.png", rgb, size)
+    rgb = read_picture(folder / "im0.png", size)
     return Scene(dataset, name, rgb, camera, _depth(path, values, camera))
 
 
@@ -136,9 +135,7 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
         expect_size(path, values, (camera_lr.height, camera_lr.width))
         values[values == 0] = np.nan
         measured[factor] = _depth(path, values / (per_pixel * factor), camera_lr)
-    rgb = read_picture(files.photo)
-    expect_size(files.photo, rgb, (height, width))
-    return Scene(dataset, name, rgb, camera, depth, measured)
+    return Scene(dataset, name, read_picture(files.photo, (height, width)), camera, depth, measured)
 
 
 def read_calibration(path: Path) -> Camera:

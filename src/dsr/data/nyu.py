@@ -79,8 +79,7 @@ def find_files(root: Path) -> dict[str, tuple[Path, Path]]:
 def load_files(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
     """Return one frame of files of their own, with its border and the filled depth."""
     size = (CAMERA.height, CAMERA.width)
-    rgb, depth = read_picture(rgb_path), to_depth(depth_path, read_map(depth_path))
-    expect_size(rgb_path, rgb, size)
+    rgb, depth = read_picture(rgb_path, size), to_depth(depth_path, read_map(depth_path))
     expect_size(depth_path, depth, size)
     return Scene(dataset, name, rgb, CAMERA, depth)
 

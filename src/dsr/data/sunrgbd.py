@@ -33,7 +33,6 @@ from dsr.data.frame_files import (
     walk,
 )
 from dsr.data.scene_source import Preparation, PreparedDataset, SceneSelection, make_records, rename_frames
-from dsr.geometry.camera import Camera
 from dsr.io.encoding import turn_back_bits
 from dsr.io.images import read_numbers
 from dsr.io.reading import SUNRGBD_BITS
@@ -58,11 +57,6 @@ def read_depth(path: Path) -> Tensor:
     return to_depth(path, turn_back_bits(str(path), read_16bit(path), SUNRGBD_BITS) / 1000)
 
 
-def read_intrinsics(path: Path, size: tuple[int, int]) -> Camera:
-    """Return the camera that an ``intrinsics.txt`` gives pictures of ``size`` = (height, width)."""
-    return to_camera(path, read_numbers(path, 9).reshape(3, 3), size)
-
-
 def load_frame(
     folder: Path, dataset: str, name: str, *, refined: bool = False, intrinsics: Intrinsics | None = None
 ) -> Scene:
@@ -81,8 +75,10 @@ def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str, intrins
     size = (rgb.shape[1], rgb.shape[2])
     expect_size(depth_path, depth, size)
     if isinstance(intrinsics, Path):
-        return Scene(dataset, name, rgb, read_intrinsics(intrinsics, size), depth)
-    return Scene(dataset, name, rgb, given_camera(intrinsics, size), depth)
+        camera = to_camera(intrinsics, read_numbers(intrinsics, 9).reshape(3, 3), size)
+    else:
+        camera = given_camera(intrinsics, size)
+    return Scene(dataset, name, rgb, camera, depth)
 
 
 def _only(folder: Path) -> Path:

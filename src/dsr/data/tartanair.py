@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from dsr.data.frame_files import expect_size, name_of, read_picture, to_depth, walk
+from dsr.data.frame_files import name_of, read_picture, to_depth, walk
 from dsr.data.scene_source import Preparation, PreparedDataset, SceneSelection, make_records
 from dsr.geometry.camera import Camera
 from dsr.io.images import read_values
@@ -54,9 +54,7 @@ def read_depth(path: Path, farthest: float = FARTHEST) -> Tensor:
 
 def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str, *, farthest: float = FARTHEST) -> Scene:
     """Return one frame at 640 x 480; depths beyond ``farthest`` metres are holes."""
-    rgb = read_picture(rgb_path)
-    expect_size(rgb_path, rgb, _SIZE)
-    return Scene(dataset, name, rgb, CAMERA, read_depth(depth_path, farthest))
+    return Scene(dataset, name, read_picture(rgb_path, _SIZE), CAMERA, read_depth(depth_path, farthest))
 
 
 DETECTED = ((find_frames, load_frame, "tartanair"),)
