@@ -8,6 +8,8 @@ import yaml
 from dsr.data.icl import FRAMES as ICL_FRAMES
 from dsr.data.icl import ICL
 from dsr.data.middlebury import EVALUATION_2014, TRAINING, Middlebury, MiddleburyLevels, MiddleburyTrain
+from dsr.data.rendered import Procedural, SimGeo
+from dsr.data.scene_source import Preparation
 from dsr.data.sunrgbd import FRAMES as SUN_FRAMES
 from dsr.data.sunrgbd import SunRGBD
 from dsr.data.tofmark import SCENES as TOFMARK_SCENES
@@ -105,16 +107,19 @@ def test_method_gets_the_range_type_that_it_was_made_for(method, range_type):
     ("make", "message"),
     [
         (lambda root: MiddleburyLevels(root, 2007), "year: expected one of 2001, 2003, 2005, 2006, got 2007"),
-        (
-            lambda root: MiddleburyTrain(root, years=[2005]),
-            "years: expected some of 2001, 2006, 2014, got 2005",
-        ),
+        (lambda root: MiddleburyTrain(root, years=[2005]), "years: expected some of 2001, 2006, 2014, got 2005"),
         (lambda root: SunRGBD(root, intrinsics=[1.0]), "intrinsics: expected fx, fy, cx, cy, got 1 numbers"),
         (lambda root: ToFMark(root, depth_range=[1.0]), "depth_range: expected 2 numbers, got 1"),
+        (lambda _: Preparation(size=31), "size: expected at least 32 pixels, or null, got 31"),
+        (lambda _: Preparation(crop=1.5), r"crop: expected a number from 0 to 1, or null, got 1\.5"),
+        (lambda _: SimGeo(size=31), "size: expected at least 32 pixels, got 31"),
+        (lambda _: Procedural(count=0), "dataset: expected count at least 1, .* got 0, 512, 0"),
+        (lambda _: Procedural(size=16), "dataset: expected .* size at least 32, .* got 200, 16, 0"),
+        (lambda _: Procedural(seed=-1), "dataset: expected .* seed at least 0; got 200, 512, -1"),
     ],
 )
 def test_values_out_of_range_are_refused(tmp_path, make, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=f"^{message}"):
         make(str(tmp_path))
 
 

@@ -162,18 +162,6 @@ def test_folder_fingerprint_covers_all_files_and_large_ones_by_size_and_time(fil
     assert (contents[0] == contents[1], len(set(contents))) == (True, 3)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"size": 31}, r"size: expected at least 32 pixels, or null, got 31"),
-        ({"crop": 1.5}, r"crop: expected a number from 0 to 1, or null, got 1\.5"),
-    ],
-)
-def test_values_out_of_range_are_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        Preparation(**settings)
-
-
 def test_record_without_high_resolution_depth_cannot_be_resized(files):
     def measured_only():
         return Scene("things", "a", torch.zeros(3, 60, 90), Camera(90, 60, 80.0, 80.0, 44.5, 29.5), None,

@@ -160,17 +160,3 @@ def test_seeds_and_sizes_do_not_share_scenes(cache):
     for source in sources:
         source.load("00000")
     assert len(list(cache.rglob("*.npz"))) == len({source.fingerprint("00000") for source in sources}) == 3
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: SimGeo(size=31), "size: expected at least 32 pixels, got 31"),
-        (lambda: Procedural(count=0), "dataset: expected count at least 1, .* got 0, 512, 0"),
-        (lambda: Procedural(size=16), "dataset: expected .* size at least 32, .* got 200, 16, 0"),
-        (lambda: Procedural(seed=-1), "dataset: expected .* seed at least 0; got 200, 512, -1"),
-    ],
-)
-def test_values_out_of_range_are_refused(make, message):
-    with pytest.raises(ValueError, match=f"^{message}"):
-        make()

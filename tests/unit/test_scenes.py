@@ -234,38 +234,26 @@ def test_damaged_prediction_is_refused_or_made_anew(tmp_path, damage):
 
 
 @pytest.mark.parametrize(
-    ("failure", "message"),
+    ("scene", "result", "message"),
     [
-        (ValueError("expected a bad\n picture"), "bad: expected a bad picture"),
-        (ValueError("data/bad/rgb.png: expected a picture"), "data/bad/rgb.png: expected a picture"),
-        (OSError(28, "No space left", "x.npz"), "bad: [Errno 28] No space left: 'x.npz'"),
-        (ValueError(""), "bad: ValueError"),
+        (ValueError("expected a bad\n picture"), None, "a: expected a bad picture"),
+        (ValueError("data/a/rgb.png: expected a picture"), None, "data/a/rgb.png: expected a picture"),
+        (OSError(28, "No space left", "x.npz"), None, "a: [Errno 28] No space left: 'x.npz'"),
+        (ValueError(""), None, "a: ValueError"),
+        (None, ValueError("too dark"), "a: too dark"),
+        (None, torch.ones(1, SIZE, SIZE - 2), "toy_method gave depth of shape"),
+        (None, torch.ones(SIZE, SIZE), "toy_method gave depth of shape"),
+        (None, torch.full_like(RAMP, math.nan), "gave no finite positive depth"),
+        (None, torch.full_like(RAMP, -1.0), "gave no finite positive depth"),
     ],
 )
-def test_bad_scene_does_not_lose_the_others_results(tmp_path, failure, message):
-    source = ToySource(a=toy_scene("a"), bad=failure, c=toy_scene("c"))
-    results, scores = run(toy_study(tmp_path, source))
-    assert results["bad"].failure == message
-    assert scores["scene"].unique().tolist() == ["a", "c"]
-    assert summary(tmp_path)["failures"] == {"bad": message}
-    assert files(tmp_path) == written("a", "c")
-
-
-@pytest.mark.parametrize(
-    ("result", "message"),
-    [
-        (ValueError("too dark"), "a: too dark"),
-        (torch.ones(1, SIZE, SIZE - 2), "toy_method gave depth of shape"),
-        (torch.ones(SIZE, SIZE), "toy_method gave depth of shape"),
-        (torch.full_like(RAMP, math.nan), "gave no finite positive depth"),
-        (torch.full_like(RAMP, -1.0), "gave no finite positive depth"),
-    ],
-)
-def test_scene_at_which_the_method_fails_is_not_written_and_the_others_are(tmp_path, result, message):
-    results, scores = run(toy_study(tmp_path, method=ToyMethod(a=result)))
+def test_bad_scene_or_failing_method_does_not_lose_the_others_results(tmp_path, scene, result, message):
+    source = ToySource(a=scene or toy_scene("a"), b=toy_scene("b"))
+    results, scores = run(toy_study(tmp_path, source, ToyMethod(a=result)))
     assert message in results["a"].failure
-    assert not (tmp_path / "predictions" / "a.npz").exists()
-    assert set(scores["scene"]) == {"b"}
+    assert summary(tmp_path)["failures"] == {"a": results["a"].failure}
+    assert scores["scene"].unique().tolist() == ["b"]
+    assert files(tmp_path) == written("b")
 
 
 def test_depths_that_are_not_finite_and_positive_count_as_holes(tmp_path):
