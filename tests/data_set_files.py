@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import h5py
 import numpy as np
 import OpenEXR
+import scipy.io
 from small_files import encoded_png as png
 from small_files import written
 
@@ -54,6 +56,22 @@ def exr(depth):
         with OpenEXR.File(header, channels) as file:
             file.write(place.name)
         return Path(place.name).read_bytes()
+
+
+def mat(**data):
+    """Return a structure as iBims-1 has it, in a MATLAB file of version 5."""
+    content = io.BytesIO()
+    scipy.io.savemat(content, {"data": data})
+    return content.getvalue()
+
+
+def labelled(depth):
+    """Return a MATLAB file of version 7.3 as NYU has it, its axes turned around, with one frame."""
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        file["images"] = np.full((1, 3, 640, 480), 51, np.uint8)
+        file["rawDepths"] = file["depths"] = depth.T[None].astype(np.float32)
+    return content.getvalue()
 
 
 def dpt(metres):
@@ -147,6 +165,11 @@ SETS = {
         "mask_invalid/corridor_01.png": png(np.ones_like(VGA, np.uint8)),
         "mask_transp/corridor_01.png": png(np.ones_like(VGA, np.uint8)), "depth/corridor_01.png": png(VGA),
     }, 1040 * 50 / 65535, (560.5, 561.25, 320, 238.5), {}, {}, {}, 100),
+    "ibims as matrices": Set(IBims, "corridor_01", {
+        "corridor_01.mat": mat(rgb=photo(480, 640), depth=VGA / 1024, mask_invalid=np.ones_like(VGA, np.uint8),
+                               mask_transp=np.ones_like(VGA, np.uint8),
+                               calib=np.array([[560.5, 0, 0], [0, 561.25, 0], [321, 239.5, 1]])),
+    }, 1040 / 1024, (560.5, 561.25, 320, 238.5), {}, {}, {}, 100),
     "icl": Set(ICL, "traj_0007", {
         "traj/rgb/7.png": png(photo(480, 640)), "traj/depth/7.png": png(VGA),
     }, 0.208, (481.2, 480, 319.5, 239.5), {}, {"size": None}, holes=png(0 * VGA)),
@@ -181,6 +204,9 @@ SETS = {
         "office/image_left/000000_left.png": png(photo(480, 640)),
         "office/depth_left/000000_left_depth.npy": npy(VGA.astype(np.float32) / 1024),
     }, 1040 / 1024, (320, 320, 320, 240), {}, {"size": None}, holes=npy(VGA.astype(np.float32) * 0)),
+    "nyu labelled": Set(NYU, "0001", {
+        "nyu_depth_v2_labeled.mat": labelled(np.roll(VGA, (44, 40), (0, 1)) / 1024),  # the border is cut off
+    }, 1040 / 1024, (518.857901, 519.469611, 324.582449 - 40, 252.736166 - 44), {}, {"size": None}, {"split": "test"}),
     "nyu": Set(NYU, "1001", {
         "DCTNet/RGB/1000.jpg": cv2.imencode(".jpg", photo(480, 640))[1].tobytes(),
         "DCTNet/Depth/1000.npy": npy(VGA.astype(np.float32) / 1024),

@@ -9,54 +9,19 @@ import subprocess
 import sys
 import threading
 import time
-from http.server import BaseHTTPRequestHandler
 
 import pytest
+from download_server import PNG, serving
 from upsampling import refused_line
 
 from dsr import cli
-from dsr.data.download import fetching
 
-PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 1000
 NAMES = [f"middlebury2003/{scene}/{name}" for scene in ("cones", "teddy") for name in ("im2.png", "disp2.png")]
-
-
-class Mirror(BaseHTTPRequestHandler):
-    """Has ``server.files``; an answer stops after half of the file for as long as ``server.go_on`` is not set."""
-
-    def do_GET(self):
-        content, start = self.server.files.get(self.path), 0
-        if content is None:
-            self.send_error(404)
-            return
-        if "Range" in self.headers:
-            start = int(self.headers["Range"].removeprefix("bytes=").removesuffix("-"))
-            self.send_response(206)
-            self.send_header("Content-Range", f"bytes {start}-{len(content) - 1}/{len(content)}")
-        else:
-            self.send_response(200)
-        self.send_header("Content-Length", str(len(content) - start))
-        self.send_header("Last-Modified", "Mon, 01 Jan 2024 00:00:00 GMT")
-        self.end_headers()
-        self.server.log.append((self.path, start))
-        half = max(len(content) // 2, start)
-        self.wfile.write(content[start:half])
-        self.wfile.flush()
-        self.server.go_on.wait(30)
-        with contextlib.suppress(OSError):  # it has gone
-            self.wfile.write(content[half:])
-
-    def log_message(self, *_):
-        pass
 
 
 @pytest.fixture
 def mirror(monkeypatch, serve):
-    monkeypatch.setattr(fetching, "RETRIES", fetching.RETRIES.new(total=1, backoff_factor=0))
-    server = serve(Mirror)
-    server.files = {f"/{name}": PNG + name.encode() for name in NAMES}
-    server.log, server.go_on = [], threading.Event()
-    server.go_on.set()
+    server = serving(serve, monkeypatch, {f"/{name}": PNG + name.encode() for name in NAMES})
     yield server
     server.go_on.set()
 
@@ -83,10 +48,10 @@ def test_dataset_is_fetched_listed_verified_and_not_fetched_twice(mirror, root, 
     before = "\n".join(lines[: lines.index(f"4 of 4 files are missing in {root}")])
     for word in ("https://vision.middlebury.edu/stereo/data/scenes2003/", "licence", "Scharstein", "CVPR 2003"):
         assert word in before
-    assert lines[-5:] == [*(f"{name}: 0.3 MB" for name in NAMES), "middlebury2003: complete"]
+    assert lines[-5:] == [*(f"{name}: 0.4 MB" for name in NAMES), "middlebury2003: complete"]
     for name in NAMES:
         assert (root / name).read_bytes() == PNG + name.encode()
-    assert [path for path, _ in mirror.log] == [f"/{name}" for name in NAMES]
+    assert [path for path, *_ in mirror.log] == [f"/{name}" for name in NAMES]
 
     assert cli.main(["data", "list"]) == 0
     rows = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
@@ -116,7 +81,7 @@ def test_interrupted_command_resumes(mirror, root):
     assert not (root / NAMES[0]).exists()
     mirror.go_on.set()
     assert run(*get).returncode == 0
-    assert mirror.log[:2] == [(f"/{NAMES[0]}", 0), (f"/{NAMES[0]}", had)]
+    assert [each[:2] for each in mirror.log[:2]] == [(f"/{NAMES[0]}", None), (f"/{NAMES[0]}", f"bytes={had}-")]
     assert (root / NAMES[0]).read_bytes() == PNG + NAMES[0].encode()
     assert not part.exists()
 

@@ -1,14 +1,17 @@
 """Data sets, of files of our own: values, names, splits, and every damage named."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
-from data_set_files import SETS, npy, opened, ramp, write_frame
+from data_set_files import SETS, exr, npy, opened, ramp, write_frame
 from refusals import refused
 from small_files import encoded_png as png
 from small_files import written
 
 from dsr.data import hammer
 from dsr.data.ddrnet_frames import DDRNetFrames
+from dsr.data.detection import find_scenes
 from dsr.data.hammer import Hammer
 from dsr.data.rgbdd import RGBDD, find_frames
 from dsr.data.sintel import Sintel
@@ -54,10 +57,11 @@ def test_frames_are_found_from_a_directory_above_and_need_all_their_files(kind, 
 
 
 def test_fingerprint_changes_with_every_file(kind, tmp_path):
-    prints = {opened(kind, tmp_path).fingerprint(kind.name)}
+    data = opened(kind, tmp_path)
+    prints = {data.fingerprint(kind.name)}
     for path in kind.files:
         (tmp_path / path).write_bytes(b"other")
-        prints.add(opened(kind, tmp_path).fingerprint(kind.name))
+        prints.add(data.fingerprint(kind.name))
     assert len(prints) == 1 + len(kind.files)
 
 
@@ -77,12 +81,38 @@ def test_damaged_or_foreign_file_is_refused_in_one_line_that_names_it(kind, tmp_
         (tmp_path / path).write_bytes(right)
 
 
-@pytest.mark.parametrize("name", [name for name, kind in SETS.items() if kind.holes])
-def test_map_of_holes_is_refused(tmp_path, capfd, name):
+NEGATIVE = {"cleargrasp": exr(-1.0 - np.ones((36, 64))), "tartanair": npy(-np.ones((480, 640), np.float32))}
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [*((name, kind.holes, "expected at least one known") for name, kind in SETS.items() if kind.holes),
+     *((name, content, "expected positive depth") for name, content in NEGATIVE.items())],
+)  # fmt: skip
+def test_map_of_holes_or_negative_depth_is_refused(tmp_path, capfd, name, content, message):
     kind = write_frame(name, tmp_path)
-    path = written(tmp_path / list(kind.files)[-1], kind.holes)
+    path = written(tmp_path / list(kind.files)[-1], content)
     data = opened(kind, tmp_path)
-    assert "expected at least one known" in refused(lambda: data.load(kind.name), path, capfd)
+    assert message in refused(lambda: data.load(kind.name), path, capfd)
+
+
+TOGETHER = ("lu", "middlebury8", "nyu", "rgbdd in circulation", "ddrnet")
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_benchmarks_are_detected_each_once_and_by_its_own_reader(tmp_path, together):
+    for name in TOGETHER:
+        for path, content in SETS["lu" if name == "middlebury8" else name].files.items():
+            file = Path(path.removeprefix("Lu/").removeprefix("DCTNet/").removeprefix("20170907/group1/"))
+            if name == "middlebury8":
+                file = Path(str(file).replace("RGBD_", "Middlebury_").replace("ouput", "output"))
+            written(tmp_path / ("" if together else name) / file, content)
+    scenes = [load() for _, load in find_scenes(tmp_path)]
+    assert sorted(scene.dataset for scene in scenes) == sorted(
+        name.removesuffix(" in circulation") for name in TOGETHER
+    )
+    units = {scene.dataset: scene.unit.name for scene in scenes}
+    assert {name for name, unit in units.items() if unit == "levels"} == {"lu", "middlebury8"}
 
 
 def test_scenes_12_to_14_of_hammer_are_to_test_on_and_naked_ones_are_left_out(tmp_path):

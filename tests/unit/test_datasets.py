@@ -8,6 +8,8 @@ import yaml
 from dsr.data.icl import FRAMES as ICL_FRAMES
 from dsr.data.icl import ICL
 from dsr.data.middlebury import EVALUATION_2014, TRAINING, Middlebury, MiddleburyLevels, MiddleburyTrain
+from dsr.data.rendered import Procedural, SimGeo
+from dsr.data.scene_source import Preparation
 from dsr.data.sunrgbd import FRAMES as SUN_FRAMES
 from dsr.data.sunrgbd import SunRGBD
 from dsr.data.tofmark import SCENES as TOFMARK_SCENES
@@ -37,16 +39,9 @@ def node(name):
     return yaml.safe_load((CONF / f"{name}.yaml").read_text())
 
 
-def test_evaluation_set_has_34_images():
-    counts = {
-        "simgeo": len(SIMGEO_SCENES), "icl": len(ICL_FRAMES), "middlebury": len(EVALUATION_2014),
-        "sunrgbd": len(SUN_FRAMES), "tofmark": len(TOFMARK_SCENES),
-    }  # fmt: skip
-    assert counts == {"simgeo": 6, "icl": 6, "middlebury": 7, "sunrgbd": 12, "tofmark": 3}
-    assert sum(counts.values()) == 34
-
-
-def test_icl_nuim_and_middlebury_scenes_have_rows_in_the_paper_tables():
+def test_evaluation_set_has_34_images_and_icl_and_middlebury_have_rows_in_the_paper_tables():
+    scenes = (SIMGEO_SCENES, ICL_FRAMES, EVALUATION_2014, SUN_FRAMES, TOFMARK_SCENES)
+    assert [len(each) for each in scenes] == [6, 6, 7, 12, 3]
     for scene in (*ICL_FRAMES, *EVALUATION_2014):
         for scale in (4, 8):
             assert published_row(scene, "Bicubic", scale) is not None
@@ -76,12 +71,6 @@ def test_frames_can_be_chosen_in_the_configuration(tmp_path):
         build("dataset", {**entries, "frames": ["a"]})
 
 
-def test_middlebury_defaults_to_the_seven_scenes_of_the_paper(tmp_path):
-    root = stereo_2014(tmp_path, (*EVALUATION_2014, "piano"))
-    assert Middlebury(root).scenes() == list(EVALUATION_2014)
-    assert sorted(Middlebury(root, "found").scenes()) == sorted((*EVALUATION_2014, "piano"))
-
-
 def test_sun_rgbd_scenes_are_found_below_any_folder_by_path_or_prefix(tmp_path):
     paths = [*list(SUN_FRAMES.values())[:-1], "xtion/sun3ddata/brown_bm_2/brown_bm_2/b", "kv1/NYUdata/NYU00011"]
     root = touch(tmp_path, *(f"SUNRGBD/{path}/{part}/x" for path in paths for part in ("image", "depth")),
@@ -93,17 +82,17 @@ def test_sun_rgbd_scenes_are_found_below_any_folder_by_path_or_prefix(tmp_path):
     assert len(SunRGBD(root, "found").scenes()) == 14
 
 
-def test_evaluation_scenes_are_not_trained_on_by_name(tmp_path):
+def test_middlebury_has_the_scenes_of_the_paper_and_none_of_them_is_trained_on(tmp_path):
     training = {scene for scenes in TRAINING.values() for scene in scenes}
     assert not training & set(EVALUATION_2014)
     assert not set(TRAINING[2014]) & (set(ICL_FRAMES) | set(SIMGEO_SCENES) | set(SUN_FRAMES) | set(TOFMARK_SCENES))
-    stereo_2014(tmp_path / "middlebury2014", (*EVALUATION_2014, *TRAINING[2014]))
-    root = str(tmp_path)
-    found = MiddleburyTrain(root, "found").scenes()
-    assert sorted(found) == sorted(TRAINING[2014])
+    root = stereo_2014(tmp_path / "middlebury2014", (*EVALUATION_2014, *TRAINING[2014]))
+    assert Middlebury(root).scenes() == list(EVALUATION_2014)
+    assert sorted(Middlebury(root, "found").scenes()) == sorted((*EVALUATION_2014, *TRAINING[2014]))
+    assert sorted(MiddleburyTrain(str(tmp_path), "found").scenes()) == sorted(TRAINING[2014])
     for scene in EVALUATION_2014:
         with pytest.raises(ValueError, match=f"'{scene}' is not there"):
-            MiddleburyTrain(root, [scene])
+            MiddleburyTrain(str(tmp_path), [scene])
 
 
 @pytest.mark.parametrize(
@@ -118,16 +107,19 @@ def test_method_gets_the_range_type_that_it_was_made_for(method, range_type):
     ("make", "message"),
     [
         (lambda root: MiddleburyLevels(root, 2007), "year: expected one of 2001, 2003, 2005, 2006, got 2007"),
-        (
-            lambda root: MiddleburyTrain(root, years=[2005]),
-            "years: expected some of 2001, 2006, 2014, got 2005",
-        ),
+        (lambda root: MiddleburyTrain(root, years=[2005]), "years: expected some of 2001, 2006, 2014, got 2005"),
         (lambda root: SunRGBD(root, intrinsics=[1.0]), "intrinsics: expected fx, fy, cx, cy, got 1 numbers"),
         (lambda root: ToFMark(root, depth_range=[1.0]), "depth_range: expected 2 numbers, got 1"),
+        (lambda _: Preparation(size=31), "size: expected at least 32 pixels, or null, got 31"),
+        (lambda _: Preparation(crop=1.5), r"crop: expected a number from 0 to 1, or null, got 1\.5"),
+        (lambda _: SimGeo(size=31), "size: expected at least 32 pixels, got 31"),
+        (lambda _: Procedural(count=0), "dataset: expected count at least 1, .* got 0, 512, 0"),
+        (lambda _: Procedural(size=16), "dataset: expected .* size at least 32, .* got 200, 16, 0"),
+        (lambda _: Procedural(seed=-1), "dataset: expected .* seed at least 0; got 200, 512, -1"),
     ],
 )
 def test_values_out_of_range_are_refused(tmp_path, make, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=f"^{message}"):
         make(str(tmp_path))
 
 

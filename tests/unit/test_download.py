@@ -11,68 +11,24 @@ import tarfile
 import zipfile
 from collections import namedtuple
 from dataclasses import replace
-from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
 import pytest
+from download_server import DATES, PNG, serving
+from small_files import written
 
 from dsr.cli import main
-from dsr.data.download import fetching
-from dsr.data.download.collections import Collection, Item
+from dsr.data.download import Collection, Item
 from dsr.data.download.fetching import Checksums, get, lock_directory, state, verify
 from dsr.utils.progress import Progress
 
-PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 1600
 OTHER = b"\x89PNG\r\n\x1a\n" + bytes(range(255, -1, -1)) * 1600
 PAGE = b"\n<!DOCTYPE html><html><body>Not here any more</body></html>"
-DATES = ("Mon, 01 Jan 2024 00:00:00 GMT", "Tue, 02 Jan 2024 00:00:00 GMT")
-
-
-class Handler(BaseHTTPRequestHandler):
-    """Sends ``server.files``; one number of ``server.cuts`` per answer is where the connection breaks off."""
-
-    protocol_version = "HTTP/1.1"
-
-    def do_GET(self):
-        server, wanted = self.server, self.headers.get("Range")
-        content = server.files.get(self.path)
-        status = server.states.pop(0) if server.states else 200
-        if content is None or status != 200:
-            server.log.append((self.path, wanted, 0))
-            self.send_error(404 if content is None else status)
-            return
-        start = 0
-        if wanted and server.ranges and self.headers["If-Range"] in server.marks.values():
-            start, status = int(wanted.removeprefix("bytes=").removesuffix("-")), 206
-        if start and start >= len(content):
-            server.log.append((self.path, wanted, 0))
-            self.answer(416, {"Content-Range": f"bytes */{len(content)}"}, b"", None)
-            return
-        headers = {"Content-Range": f"bytes {start}-{len(content) - 1}/{len(content)}"} if start else {}
-        cut = server.cuts.pop(0) if server.cuts else None
-        server.log.append((self.path, wanted, len(content) - start if cut is None else cut))
-        self.answer(status, {**headers, **server.marks, **server.headers}, content[start:], cut)
-
-    def answer(self, status, headers, content, cut):
-        self.send_response(status)
-        for key, value in {**headers, "Content-Length": len(content)}.items():
-            self.send_header(key, str(value))
-        self.end_headers()
-        self.wfile.write(content[:cut])
-        if cut is not None:
-            self.close_connection = True
-
-    def log_message(self, *_):
-        pass
 
 
 @pytest.fixture
 def server(monkeypatch, serve):
-    monkeypatch.setattr(fetching, "RETRIES", fetching.RETRIES.new(total=2, backoff_factor=0))
-    running = serve(Handler)
-    running.files, running.states, running.cuts, running.log = {"/a.png": PNG}, [], [], []
-    running.ranges, running.marks, running.headers = True, {"Last-Modified": DATES[0]}, {}
-    return running
+    return serving(serve, monkeypatch, {"/a.png": PNG})
 
 
 class Watcher(Progress):
@@ -155,31 +111,24 @@ def test_later_command_resumes_a_partial_file(server, tmp_path):
     assert left_in(tmp_path) == ["set/a.png"]
 
 
-def test_interruption_keeps_the_partial_file(server, tmp_path):
+@pytest.mark.parametrize(
+    ("stop_at", "changes", "sent"),
+    [
+        (200_000, {}, lambda had: len(PNG) - had),
+        (200_000, {"files": {"/a.png": OTHER}, "marks": {"Last-Modified": DATES[1]}}, lambda had: len(OTHER)),
+        (len(PNG), {}, lambda had: 0),  # it had come whole
+    ],
+)
+def test_interrupted_transfer_goes_on_unless_the_file_has_changed(server, tmp_path, stop_at, changes, sent):
     with pytest.raises(KeyboardInterrupt):
-        get([picture(server)], tmp_path, Watcher(stop_at=200_000))
+        get([picture(server)], tmp_path, Watcher(stop_at))
     assert left_in(tmp_path) == ["set/a.png.part"]
     had = (tmp_path / "set/a.png.part").stat().st_size
-    assert had >= 200_000
+    assert had >= stop_at
+    vars(server).update(changes)
     assert fetched(picture(server), tmp_path) == []
-    assert server.log[-1][1:] == (f"bytes={had}-", len(PNG) - had)
-
-
-def test_file_that_changed_in_between_starts_anew(server, tmp_path):
-    with pytest.raises(KeyboardInterrupt):
-        get([picture(server)], tmp_path, Watcher(stop_at=200_000))
-    server.files["/a.png"], server.marks = OTHER, {"Last-Modified": DATES[1]}
-    assert fetched(picture(server), tmp_path) == []
-    assert server.log[-1][2] == len(OTHER)
-    assert (tmp_path / "set/a.png").read_bytes() == OTHER
-
-
-def test_file_that_came_whole_before_an_interruption_is_not_fetched_again(server, tmp_path):
-    with pytest.raises(KeyboardInterrupt):
-        get([picture(server)], tmp_path, Watcher(stop_at=len(PNG)))
-    assert fetched(picture(server), tmp_path) == []
-    assert [sent for _, _, sent in server.log] == [len(PNG), 0]
-    assert (tmp_path / "set/a.png").read_bytes() == PNG
+    assert server.log[-1][1:] == (f"bytes={had}-", sent(had))
+    assert (tmp_path / "set/a.png").read_bytes() == server.files["/a.png"]
 
 
 @pytest.mark.parametrize("state", [{"ranges": False}, {"marks": {}}])
@@ -197,39 +146,22 @@ def test_busy_server_is_retried(server, tmp_path):
     assert len(server.log) == 3
 
 
-def test_second_address_is_used_where_the_first_lacks_the_file(server, tmp_path):
-    assert fetched(picture(server, "/gone.png", "/a.png"), tmp_path) == []
-    assert [path for path, _, _ in server.log] == ["/gone.png", "/a.png"]
-    assert (tmp_path / "set/a.png").read_bytes() == PNG
-
-
 def test_file_found_nowhere_is_one_line_and_the_others_come(server, tmp_path):
-    items = [picture(server, "/gone.png", "/lost.png", name="x.png"), picture(server)]
-    one_line(
-        fetched(items, tmp_path),
-        f"set/x.png: {server.url}/gone.png: HTTP 404 Not Found; {server.url}/lost.png: HTTP 404 Not Found",
-    )
-    assert left_in(tmp_path) == ["set/a.png"]
-
-
-def test_unreachable_server_is_one_line_per_file(server, tmp_path):
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
-        gone = f"http://127.0.0.1:{closed.getsockname()[1]}"
-        items = [Item(f"set/{name}", (f"{gone}/{name}",)) for name in ("x.png", "y.png")]
-        problems = fetched([*items, picture(server)], tmp_path)
-    assert [problem.split(": ", 1)[0] for problem in problems] == ["set/x.png", "set/y.png"]
-    for problem in problems:
-        one_line([problem], f"{gone}/", f"no connection to {gone.removeprefix('http://')}")
+        gone = f"127.0.0.1:{closed.getsockname()[1]}"
+        items = [picture(server, "/gone.png", "/lost.png", name="x.png"), Item("set/y.png", (f"http://{gone}/y.png",))]
+        first, second = fetched([*items, picture(server)], tmp_path)
+    url = server.url
+    assert first == f"set/x.png: {url}/gone.png: HTTP 404 Not Found; {url}/lost.png: HTTP 404 Not Found"
+    assert second == f"set/y.png: http://{gone}/y.png: no connection to {gone}"
     assert left_in(tmp_path) == ["set/a.png"]
 
 
 @pytest.mark.parametrize(
     ("name", "content"),
-    [
-        ("a.png", b"GIF89a nothing"), ("a.zip", PNG), ("a.tar.gz", PNG), ("a.pfm", PNG), ("a.txt", b"\0\1"),
-        ("a.mat", PNG), ("a.ppm", PNG), ("a.pgm", PNG), ("a.npy", PNG), ("a.txt", PAGE), ("a.png", b""),
-    ],
+    [("a.png", b"GIF89a nothing"), ("a.zip", PNG), ("a.tar.gz", PNG), ("a.mat", PNG), ("a.txt", b"\0\1"),
+     ("a.txt", PAGE), ("a.png", b"")],
 )  # fmt: skip
 def test_file_of_the_wrong_kind_is_refused(server, tmp_path, name, content):
     server.files["/a.png"] = content
@@ -252,12 +184,13 @@ def test_other_checksum_than_recorded_or_pinned_is_refused(server, tmp_path, pin
     assert Checksums(tmp_path)["set/a.png"].sha256 == sha256(PNG)
 
 
-def test_mirror_is_asked_first_under_the_same_path(server, tmp_path):
+def test_mirror_is_asked_first_under_the_same_path_and_addresses_in_turn(server, tmp_path):
     server.files["/mirror/set/a.png"] = PNG
     assert fetched(picture(server), tmp_path, mirror=f"{server.url}/mirror/") == []
-    assert [path for path, _, _ in server.log] == ["/mirror/set/a.png"]
-    assert fetched(picture(server, name="b.png"), tmp_path, mirror=f"{server.url}/mirror") == []
-    assert [path for path, _, _ in server.log[1:]] == ["/mirror/set/b.png", "/a.png"]
+    item = picture(server, "/gone.png", "/a.png", name="b.png")
+    assert fetched(item, tmp_path, mirror=f"{server.url}/mirror") == []
+    assert [path for path, *_ in server.log] == ["/mirror/set/a.png", "/mirror/set/b.png", "/gone.png", "/a.png"]
+    assert (tmp_path / "set/b.png").read_bytes() == PNG
 
 
 def test_archive_member_stands_for_a_file(server, tmp_path):
@@ -289,6 +222,10 @@ def zipped(files):
         for name, content in files.items():
             packed.writestr(name, content)
     return buffer.getvalue()
+
+
+LINK = zipfile.ZipInfo("rgb/evil")
+LINK.external_attr = 0o120777 << 16
 
 
 def tarred(files, *members):
@@ -337,6 +274,7 @@ OUTSIDE = {
     "up inside": ("s.zip", zipped({"rgb/../../../evil.txt": b"evil"})),
     "backslashes": ("s.zip", zipped({"rgb\\..\\..\\evil.txt": b"evil"})),
     "a drive": ("s.zip", zipped({"C:/evil.txt": b"evil"})),
+    "a link in a zip": ("s.zip", zipped({LINK: "../../evil.txt"})),
     "absolute": ("s.tar.gz", tarred({"rgb/1.png": PNG, "/tmp/dsr_evil.txt": b"evil"})),
     "up in a tar": ("s.tar.gz", tarred({"../evil.txt": b"evil"})),
     "a link up": ("s.tar.gz", tarred({"rgb/1.png": PNG}, ("rgb/evil", tarfile.SYMTYPE, "../../evil.txt"))),
@@ -357,29 +295,17 @@ def test_archive_with_paths_outside_is_refused_before_anything_is_unpacked(serve
     assert not Path("/tmp/dsr_evil.txt").exists()
 
 
-def test_link_in_a_zip_is_refused(server, tmp_path):
-    member = zipfile.ZipInfo("rgb/evil")
-    member.external_attr = 0o120777 << 16
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as packed:
-        packed.writestr(member, "../../evil.txt")
-    one_line(fetched(archive(server, "s.zip", buffer.getvalue()), tmp_path), "'rgb/evil' in it is neither a file nor")
-
-
 @pytest.mark.parametrize("name", PACKED)
-@pytest.mark.parametrize("share", [0.2, 0.7])
-def test_truncated_archive_is_refused_and_nothing_of_it_left(server, tmp_path, name, share):
+@pytest.mark.parametrize(
+    ("share", "message"), [(0.2, "an archive, got a"), (0.7, "an archive, got a"), (1, "depth in it")]
+)
+def test_archive_that_is_truncated_or_lacks_a_folder_is_refused_and_nothing_of_it_left(
+    server, tmp_path, name, share, message
+):
     content = PACKED[name][: int(len(PACKED[name]) * share)]
-    one_line(
-        fetched(archive(server, name, content), tmp_path), f"{tmp_path / 'set' / name}: expected an archive, got a"
-    )
+    problems = fetched(archive(server, name, content, ("rgb", "depth")), tmp_path)
+    one_line(problems, f"{tmp_path / 'set' / name}: expected {message}")
     assert left_in(tmp_path) == [f"set/{name}"]
-
-
-def test_archive_of_other_files_is_refused(server, tmp_path):
-    problems = fetched(archive(server, "s.zip", PACKED["s.zip"], ("rgb", "depth")), tmp_path)
-    one_line(problems, "expected depth in it, there is none")
-    assert left_in(tmp_path) == ["set/s.zip"]
 
 
 def test_interrupted_unpacking_leaves_nothing_and_needs_no_second_download(server, tmp_path, monkeypatch):
@@ -434,11 +360,9 @@ def test_verification_names_files_of_another_size_and_missing_ones(server, tmp_p
 
 def test_files_from_elsewhere_are_recorded_as_they_are(server, tmp_path):
     item = picture(server)
-    (tmp_path / "set").mkdir()
-    (tmp_path / "set/a.png").write_bytes(PNG)
+    for name in "abc":
+        written(tmp_path / f"set/{name}.png", PNG)
     assert verified(collection(item), tmp_path) == ([], [f"{tmp_path}/checksums.json: recorded as found: set/a.png"])
-    (tmp_path / "set/b.png").write_bytes(PNG)
-    (tmp_path / "set/c.png").write_bytes(PNG)
     items, watcher = [picture(server, name=f"{name}.png") for name in "bca"], Watcher()
     assert get(items, tmp_path, watcher) == []
     assert watcher.lines == [f"{tmp_path}/checksums.json: recorded as found: set/{name}.png" for name in "bc"]
@@ -449,30 +373,24 @@ def test_files_from_elsewhere_are_recorded_as_they_are(server, tmp_path):
 MANUAL = collection(manual="put *.mat into {folder}", patterns=("*.mat", "*/P*/*.png"))
 
 
-def test_manual_route_names_what_is_missing_and_its_place(tmp_path):
+def test_manual_route_names_what_is_missing_records_once_and_checks_afterwards(tmp_path):
+    folder = tmp_path / "set"
     problems, _ = verified(MANUAL, tmp_path)
-    assert [problem.split(": ")[1] for problem in problems] == [
-        "expected *.mat, there is none",
-        "expected */P*/*.png, there is none",
-    ]
-    for problem in problems:
-        assert problem.startswith(f"{tmp_path / 'set'}: ")
-        assert f"put *.mat into {tmp_path / 'set'}, then `dsr data verify mine`" in problem
-
-
-def test_manual_route_records_once_and_checks_afterwards(tmp_path):
+    for problem, pattern in zip(problems, MANUAL.patterns, strict=True):
+        assert problem.startswith(f"{folder}: expected {pattern}, there is none: put *.mat into {folder}, then")
+        assert "`dsr data verify mine`" in problem
+    assert state(MANUAL, tmp_path) == "manual"
     for name, content in {"set/a.mat": b"MATLAB 5.0", "set/sea/P000/1.png": PNG}.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_bytes(content)
+        written(tmp_path / name, content)
+    assert state(MANUAL, tmp_path) == "complete"
     recorded = f"{tmp_path}/checksums.json: recorded as found: set/a.mat, set/sea/P000/1.png"
     assert verified(MANUAL, tmp_path) == ([], [recorded])
     assert verified(MANUAL, tmp_path) == ([], [])
     (tmp_path / "set/a.mat").write_bytes(b"MATLAB 7.3")
     (tmp_path / "set/sea/P000/1.png").rename(tmp_path / "set/sea/P000/2.png")
-    problems, _ = verified(MANUAL, tmp_path)
-    assert len(problems) == 2
-    assert "set/sea/P000/1.png: expected a file as recorded, there is none" in problems[0]
-    assert f"got {sha256(b'MATLAB 7.3')}" in problems[1]
+    missing, other = verified(MANUAL, tmp_path)[0]
+    assert "set/sea/P000/1.png: expected a file as recorded, there is none" in missing
+    assert f"got {sha256(b'MATLAB 7.3')}" in other
 
 
 def test_collection_state_is_reported(server, tmp_path):
@@ -484,21 +402,13 @@ def test_collection_state_is_reported(server, tmp_path):
     assert state(collection(*items), tmp_path) == "complete"
     (tmp_path / "set/room/rgb/2.png").unlink()
     assert state(collection(*items), tmp_path) == "partial 2 of 3"
-    assert state(MANUAL, tmp_path) == "manual"
-    (tmp_path / "set/sea/P000").mkdir(parents=True)
-    (tmp_path / "set/sea/P000/1.png").write_bytes(PNG)
-    (tmp_path / "set/a.mat").write_bytes(b"MATLAB")
-    assert state(MANUAL, tmp_path) == "complete"
 
 
-@pytest.mark.parametrize(
-    "text", ["", "{", "[]", "3", '{"a": 3}', '{"a": {"size": "3"}}', '{"a": {"size": 3, "sha256": 5}}']
-)
+@pytest.mark.parametrize("text", ["", "[]", '{"a": 3}', '{"a": {"size": "3"}}', '{"a": {"size": 3, "sha256": 5}}'])
 def test_damaged_records_are_one_line(server, tmp_path, text):
-    (tmp_path / "checksums.json").write_text(text)
-    with pytest.raises(ValueError, match="expected the checksums of the data sets") as caught:
+    path = written(tmp_path / "checksums.json", text.encode())
+    with pytest.raises(ValueError, match=f"^{path}: expected the checksums of the data sets.*$"):
         fetched(picture(server), tmp_path)
-    one_line([str(caught.value)], tmp_path / "checksums.json")
 
 
 def test_second_command_is_refused_while_one_writes(server, tmp_path):

@@ -5,7 +5,7 @@ from collections import Counter
 from pathlib import PurePosixPath
 from urllib.parse import urlsplit
 
-from dsr.data.download.collections import CATALOGUE
+from dsr.data.download import CATALOGUE
 
 ITEMS = [item for collection in CATALOGUE.values() for item in collection.items]
 

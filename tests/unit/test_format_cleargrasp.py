@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 from data_set_files import SETS, exr, opened, write_frame
-from refusals import refused
 from small_files import encoded_png as png
 from small_files import written
 
@@ -67,12 +66,6 @@ def test_scenes_are_found_by_split_and_need_all_their_files(tmp_path):
     assert list(find_renderings(tmp_path, "val")) == ["cup-val/0"]
     assert ClearGrasp(str(tmp_path), True, "val").evaluation
     assert not ClearGrasp(str(tmp_path), True, "train").evaluation
-
-
-def test_depth_that_is_negative_is_refused(tmp_path, capfd):
-    kind = write_frame("cleargrasp", tmp_path)
-    path = written(tmp_path / list(kind.files)[-1], exr(-1.0 - ROWS))
-    assert "expected positive depth" in refused(lambda: opened(kind, tmp_path).load(kind.name), path, capfd)
 
 
 def test_real_captures_agree_outside_of_the_glass(shared):

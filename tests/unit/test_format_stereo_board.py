@@ -6,21 +6,16 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from small_files import encoded_png as png
+from data_set_files import SETS
 from small_files import written
 
 from dsr.data.stereo_board import BOARDS, CAMERA, LENS, StereoBoard, find_frames, load_frame
 
-ROWS, COLUMNS = np.mgrid[0:1080, 0:1920]
-MEASURED = (1000 + ROWS // 2 + COLUMNS // 4).astype(np.uint16)
-PHOTO = png(np.full((1080, 1920, 3), 51, np.uint8))
-
 
 def frame(root, name="14", suffix="png"):
-    """Write a frame with a hole in a corner."""
-    measured = MEASURED.copy()
-    measured[0, 0] = 0
-    return written(root / f"color/{name}.{suffix}", PHOTO), written(root / f"depth/{name}.png", png(measured))
+    """Write a frame."""
+    color, depth = SETS["stereo_board"].files.values()
+    return written(root / f"color/{name}.{suffix}", color), written(root / f"depth/{name}.png", depth)
 
 
 @pytest.mark.parametrize("name", BOARDS)

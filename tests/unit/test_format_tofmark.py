@@ -2,6 +2,7 @@
 
 import struct
 
+import cv2
 import h5py
 import numpy as np
 import pytest
@@ -23,14 +24,8 @@ GREY = ((ROWS * 7 + COLUMNS) % 256).astype(np.uint8)
 
 
 def bmp(levels):
-    """Return a Windows bitmap of 256 greys: rows from the bottom up, each padded to four bytes."""
-    height, width = levels.shape
-    padding = bytes(-width % 4)
-    pixels = b"".join(row.astype(np.uint8).tobytes() + padding for row in levels[::-1])
-    palette = b"".join(bytes((level, level, level, 0)) for level in range(256))
-    header = struct.pack("<2sIII", b"BM", 1078 + len(pixels), 0, 1078)
-    info = struct.pack("<IiiHHIIiiII", 40, width, height, 1, 8, 0, len(pixels), 0, 0, 256, 0)
-    return header + info + palette + pixels
+    """Return a Windows bitmap of 256 greys."""
+    return cv2.imencode(".bmp", levels.astype(np.uint8))[1].tobytes()
 
 
 def old(path, variables, *, compress=False):
@@ -56,22 +51,13 @@ def pictures(tmp_path):
     return written(tmp_path / "books.bmp", bmp(GREY)), written(tmp_path / "books_depth.bmp", bmp(levels))
 
 
-def test_samples_are_levels_divided_by_255_and_0_is_none(pictures):
-    values, known = read_samples(pictures[1])
-    assert known.sum().item() == 28
-    assert values.shape == (1, *SIZE)
-    assert values[0, 1, 8].item() == 1.0
-    assert values[0, 7, 2].item() == 61 / 255
-
-
-def test_range_of_the_caller_converts_levels_to_metres(pictures):
-    scene = load_frame(*pictures, "tofmark", "books", intrinsics=INTRINSICS, depth_range=(0.5, 3.04), factors=(1, 4))
+def test_range_of_the_caller_converts_levels_to_metres_and_0_is_no_sample(pictures):
+    scene = load_frame(*pictures, "tofmark", "books", intrinsics=INTRINSICS, depth_range=(0.5, 3.04))
     assert scene.depth is None
-    assert scene.measured[1][0, 1, 2].item() == pytest.approx(0.5)
-    assert scene.measured[1][0, 1, 8].item() == pytest.approx(3.04)
-    assert scene.measured[1][0, 7, 2].item() == pytest.approx(0.5 + 60 * 0.01)
-    assert scene.measured[1].isfinite().sum().item() == 28
     assert scene.measured[4].shape == (1, 5, 10)
+    samples = scene.measured[4][0]  # a sample in 28 of the blocks
+    assert samples[[0, 0, 1], [0, 2, 0]].tolist() == pytest.approx([0.5, 3.04, 0.5 + 60 * 0.01])
+    assert samples.isfinite().sum().item() == 28
     assert (scene.camera.height, scene.camera.width, scene.camera.cy) == (*SIZE, 9.5)
     np.testing.assert_array_equal((scene.rgb * 255).round()[2], GREY)
 
@@ -83,9 +69,7 @@ def test_pictures_without_a_range_or_a_camera_are_refused_with_the_reason(pictur
     assert "no camera" in refused(lambda: load_frame(rgb, samples, "t", "b", depth_range=(0.5, 1)), rgb, capfd)
 
 
-@pytest.mark.parametrize(
-    "content", [b"", b"BM", bmp(GREY)[:1078], bmp(GREY)[:-400], b"text", bmp(GREY * 0), bmp(GREY[:21])]
-)
+@pytest.mark.parametrize("content", [b"", bmp(GREY)[:1078], bmp(GREY)[:-400], b"text", bmp(GREY * 0), bmp(GREY[:21])])
 def test_damaged_picture_of_samples_is_refused(pictures, capfd, content):
     rgb, samples = pictures
     written(samples, content)
@@ -149,19 +133,14 @@ def test_matrices_of_every_type_are_read_and_other_content_is_skipped(tmp_path, 
         assert found[name].dtype == array.dtype or name == "logical"
 
 
-def test_variable_names_can_be_given_by_the_caller(tmp_path):
+def test_variable_names_can_be_given_by_the_caller_and_truth_may_be_missing(tmp_path):
     path = old(tmp_path / "a.mat", {"x": GREY / 255, "y": TRUTH, "z": TRUTH + 1, "w": SPARSE})
     rgb, depth, samples = read_matrices(path, {"intensity": "x", "depth": "z"})
     np.testing.assert_allclose(rgb[1], GREY / 255, rtol=1e-6)
     np.testing.assert_array_equal(depth[0], TRUTH + 1)
     assert samples.isfinite().sum().item() == (SPARSE > 0).sum()
-
-
-def test_truth_may_be_missing_and_holes_may_be_nan(tmp_path):
-    path = old(tmp_path / "a.mat", {"intensity": GREY, "tof": np.where(SPARSE, SPARSE, np.nan)})
-    _, depth, samples = read_matrices(path)
-    assert depth is None
-    assert samples.isfinite().sum().item() == (SPARSE > 0).sum()
+    _, depth, samples = read_matrices(old(path, {"intensity": GREY, "tof": np.where(SPARSE, SPARSE, np.nan)}))
+    assert (depth, samples.isfinite().sum().item()) == (None, (SPARSE > 0).sum())
 
 
 @pytest.mark.parametrize(
@@ -187,9 +166,8 @@ def test_file_of_other_variables_is_refused_with_their_names(tmp_path, capfd, va
 @pytest.mark.parametrize(
     "damage",
     [
-        lambda whole: b"", lambda whole: b"text, no matrix", lambda whole: whole[:128], lambda whole: whole[:600],
-        lambda whole: whole[: len(whole) // 2], lambda whole: whole[:132] + b"\xff" * 800 + whole[932:],
-        lambda whole: bytes(5000),
+        lambda whole: b"", lambda whole: b"text, no matrix", lambda whole: whole[: len(whole) // 2],
+        lambda whole: whole[:132] + b"\xff" * 800 + whole[932:],
     ],
 )  # fmt: skip
 def test_damaged_mat_file_is_refused_in_one_line(tmp_path, capfd, make, damage):
@@ -226,7 +204,6 @@ def test_real_pictures_have_samples_in_a_fortieth_of_their_pixels(shared):
     assert list(frames) == ["books", "devil", "shark"]
     for name, files in frames.items():
         assert read_samples(files[1])[1].double().mean().item() == pytest.approx(0.025, abs=0.001)
-        arguments = {"intrinsics": (550.0, 550.0, 404.5, 304.5), "depth_range": (0.38, 0.93)}
-        scene = load_frame(*files, "tofmark", name, **arguments)
+        scene = load_frame(*files, "tofmark", name, intrinsics=(550.0, 550.0, 404.5, 304.5), depth_range=(0.38, 0.93))
         assert scene.measured[4].shape == (1, 152, 202)
         assert scene.measured[8].isfinite().double().mean() > 0.98

@@ -93,6 +93,12 @@ def files(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 
+def written(*scenes):
+    """Return the files of a run with predictions of these scenes."""
+    places = [f"{place}/{scene}.npz" for place in ("predictions", "scenes") for scene in scenes]
+    return [*places, "scores.csv", "summary.json"]
+
+
 def rows(folder):
     with (folder / "scores.csv").open(newline="") as file:
         return list(csv.DictReader(file))
@@ -108,21 +114,14 @@ def replace_depth(path, depth):
     np.savez(path, depth=depth, config=config, seconds=1.0)
 
 
-def test_run_writes_predictions_scores_and_a_summary_and_nothing_else(tmp_path):
+def test_run_writes_predictions_in_metres_with_their_config_scores_and_a_summary_and_nothing_else(tmp_path):
     run(toy_study(tmp_path))
-    assert files(tmp_path) == [
-        *("predictions/a.npz", "predictions/b.npz"),
-        *("scenes/a.npz", "scenes/b.npz", "scores.csv", "summary.json"),
-    ]
+    assert files(tmp_path) == written("a", "b")
     content = summary(tmp_path)
     assert (content["dataset"], content["method"], content["scale"], content["seed"]) == ("toy", "toy_method", 2, 7)
     assert (content["scenes"], content["predicted"], content["reused"]) == (2, ["a", "b"], [])
     assert (content["failures"], content["without_truth"], list(content["seconds"])) == ({}, [], ["a", "b"])
     assert len(set(content["truths"].values())) == 2
-
-
-def test_prediction_is_in_metres_with_its_config(tmp_path):
-    run(toy_study(tmp_path))
     with np.load(tmp_path / "predictions" / "a.npz") as kept:
         depth, config = kept["depth"], json.loads(str(kept["config"]))
     blocks = RAMP[0].numpy().reshape(8, 2, 8, 2).mean(axis=(1, 3))
@@ -176,9 +175,11 @@ def test_summary_and_pictures_have_the_worst_of_four_lights(tmp_path):
     assert torch.equal(depth, load_prediction(tmp_path / "predictions" / "a.npz"))
 
 
-def test_second_run_reuses_predictions_without_calling_the_method(tmp_path):
+def test_second_run_reuses_predictions_without_calling_the_method_and_stores_a_missing_sample_again(tmp_path):
     _, first = run(toy_study(tmp_path))
     before = {name: (tmp_path / name).stat().st_mtime_ns for name in files(tmp_path) if name.startswith("pred")}
+    sample = DepthSample.load(tmp_path / "scenes" / "a.npz")
+    (tmp_path / "scenes" / "a.npz").unlink()
     method = ToyMethod()
     results, second = run(toy_study(tmp_path, method=method))
     assert method.calls == []
@@ -186,6 +187,7 @@ def test_second_run_reuses_predictions_without_calling_the_method(tmp_path):
     assert summary(tmp_path)["reused"] == ["a", "b"]
     assert before == {name: (tmp_path / name).stat().st_mtime_ns for name in before}
     assert first.equals(second)
+    assert torch.equal(DepthSample.load(tmp_path / "scenes" / "a.npz").depth_lr, sample.depth_lr)
 
 
 def test_overwrite_makes_every_prediction_anew_and_replaces_it_atomically(tmp_path):
@@ -232,41 +234,26 @@ def test_damaged_prediction_is_refused_or_made_anew(tmp_path, damage):
 
 
 @pytest.mark.parametrize(
-    ("failure", "message"),
+    ("scene", "result", "message"),
     [
-        (ValueError("expected a bad\n picture"), "bad: expected a bad picture"),
-        (ValueError("data/bad/rgb.png: expected a picture"), "data/bad/rgb.png: expected a picture"),
-        (OSError(28, "No space left", "x.npz"), "bad: [Errno 28] No space left: 'x.npz'"),
-        (ValueError(""), "bad: ValueError"),
+        (ValueError("expected a bad\n picture"), None, "a: expected a bad picture"),
+        (ValueError("data/a/rgb.png: expected a picture"), None, "data/a/rgb.png: expected a picture"),
+        (OSError(28, "No space left", "x.npz"), None, "a: [Errno 28] No space left: 'x.npz'"),
+        (ValueError(""), None, "a: ValueError"),
+        (None, ValueError("too dark"), "a: too dark"),
+        (None, torch.ones(1, SIZE, SIZE - 2), "toy_method gave depth of shape"),
+        (None, torch.ones(SIZE, SIZE), "toy_method gave depth of shape"),
+        (None, torch.full_like(RAMP, math.nan), "gave no finite positive depth"),
+        (None, torch.full_like(RAMP, -1.0), "gave no finite positive depth"),
     ],
 )
-def test_bad_scene_does_not_lose_the_others_results(tmp_path, failure, message):
-    source = ToySource(a=toy_scene("a"), bad=failure, c=toy_scene("c"))
-    results, scores = run(toy_study(tmp_path, source))
-    assert results["bad"].failure == message
-    assert scores["scene"].unique().tolist() == ["a", "c"]
-    assert summary(tmp_path)["failures"] == {"bad": message}
-    assert files(tmp_path) == [
-        *("predictions/a.npz", "predictions/c.npz"),
-        *("scenes/a.npz", "scenes/c.npz", "scores.csv", "summary.json"),
-    ]
-
-
-@pytest.mark.parametrize(
-    ("result", "message"),
-    [
-        (ValueError("too dark"), "a: too dark"),
-        (torch.ones(1, SIZE, SIZE - 2), "toy_method gave depth of shape"),
-        (torch.ones(SIZE, SIZE), "toy_method gave depth of shape"),
-        (torch.full_like(RAMP, math.nan), "gave no finite positive depth"),
-        (torch.full_like(RAMP, -1.0), "gave no finite positive depth"),
-    ],
-)
-def test_scene_at_which_the_method_fails_is_not_written_and_the_others_are(tmp_path, result, message):
-    results, scores = run(toy_study(tmp_path, method=ToyMethod(a=result)))
+def test_bad_scene_or_failing_method_does_not_lose_the_others_results(tmp_path, scene, result, message):
+    source = ToySource(a=scene or toy_scene("a"), b=toy_scene("b"))
+    results, scores = run(toy_study(tmp_path, source, ToyMethod(a=result)))
     assert message in results["a"].failure
-    assert not (tmp_path / "predictions" / "a.npz").exists()
-    assert set(scores["scene"]) == {"b"}
+    assert summary(tmp_path)["failures"] == {"a": results["a"].failure}
+    assert scores["scene"].unique().tolist() == ["b"]
+    assert files(tmp_path) == written("b")
 
 
 def test_depths_that_are_not_finite_and_positive_count_as_holes(tmp_path):
@@ -288,12 +275,18 @@ def test_picture_that_cannot_be_drawn_fails_its_scene_and_keeps_its_scores(tmp_p
     assert {row["scene"] for row in rows(tmp_path)} == {"a", "b"}
 
 
-def test_stored_prediction_of_the_wrong_shape_is_not_scored(tmp_path):
-    study = toy_study(tmp_path)
+@pytest.mark.parametrize("damage", ["prediction", "sample"])
+def test_stored_prediction_of_the_wrong_shape_or_beside_a_damaged_sample_is_not_scored(tmp_path, damage):
+    study, sample = toy_study(tmp_path), tmp_path / "scenes" / "a.npz"
     run(study)
-    replace_depth(tmp_path / "predictions" / "a.npz", np.ones((3, 5)))
+    if damage == "prediction":
+        replace_depth(tmp_path / "predictions" / "a.npz", np.ones((3, 5)))
+        message = "expected a prediction of shape (1, 16, 16), got (1, 3, 5)"
+    else:
+        sample.write_bytes(sample.read_bytes()[:50])
+        message = f"{sample}: expected the sample of a scene, got a damaged or foreign file"
     results, scores = run(study)
-    assert "expected a prediction of shape (1, 16, 16), got (1, 3, 5)" in results["a"].failure
+    assert message in results["a"].failure
     assert scores["scene"].unique().tolist() == ["b"]
 
 
@@ -320,17 +313,22 @@ def test_cropped_scene_is_noted(tmp_path):
     assert summary(tmp_path)["notes"] == {"odd": ["cropped from 16 x 17 to 16 x 16, which 2 divides"]}
 
 
+def half_written(error):
+    """Return a writer of arrays that fails after half a file."""
+
+    def write(path, **arrays):
+        path.write_bytes(b"half a file")
+        raise error
+
+    return write
+
+
 def test_interruption_keeps_the_finished_scene_and_leaves_no_temporary_file(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         run(toy_study(tmp_path, method=ToyMethod(b=KeyboardInterrupt())))
     assert files(tmp_path) == ["predictions/a.npz", "scenes/a.npz"]
-
-    def cut(path, **arrays):
-        path.write_bytes(b"half a file")
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(np, "savez_compressed", cut)
+        patch.setattr(np, "savez_compressed", half_written(KeyboardInterrupt()))
         with pytest.raises(KeyboardInterrupt):
             run(toy_study(tmp_path))
     assert [name for name in files(tmp_path) if name.startswith("pred")] == ["predictions/a.npz"]
@@ -343,12 +341,7 @@ def test_interruption_keeps_the_finished_scene_and_leaves_no_temporary_file(tmp_
 def test_full_disk_ends_the_pass_and_keeps_the_former_prediction(tmp_path, monkeypatch):
     run(toy_study(tmp_path))
     before = (tmp_path / "predictions" / "a.npz").read_bytes()
-
-    def full(path, **arrays):
-        path.write_bytes(b"half a file")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(np, "savez_compressed", full)
+    monkeypatch.setattr(np, "savez_compressed", half_written(OSError(28, "No space left on device")))
     with pytest.raises(FullDiskError, match=r"a\.npz: expected space to write the file"):
         run(toy_study(tmp_path), overwrite=True)
     assert (tmp_path / "predictions" / "a.npz").read_bytes() == before
@@ -403,23 +396,3 @@ def test_scene_without_a_solution_is_a_result_and_no_failure_and_its_earlier_pre
     assert content["failures"] == {}
     assert set(scores["scene"]) == {"a"}
     assert not (tmp_path / "predictions" / "b.npz").exists()
-
-
-def test_sample_that_is_missing_beside_its_prediction_is_stored_again(tmp_path):
-    run(toy_study(tmp_path))
-    before = DepthSample.load(tmp_path / "scenes" / "a.npz")
-    (tmp_path / "scenes" / "a.npz").unlink()
-    method = ToyMethod()
-    _, scores = run(toy_study(tmp_path, method=method))
-    assert (method.calls, summary(tmp_path)["reused"]) == ([], ["a", "b"])
-    assert torch.equal(DepthSample.load(tmp_path / "scenes" / "a.npz").depth_lr, before.depth_lr)
-    assert set(scores["scene"]) == {"a", "b"}
-
-
-def test_damaged_sample_is_named_and_the_other_scenes_are_kept(tmp_path):
-    run(toy_study(tmp_path))
-    path = tmp_path / "scenes" / "a.npz"
-    path.write_bytes(path.read_bytes()[:50])
-    results, scores = run(toy_study(tmp_path))
-    assert results["a"].failure == f"{path}: expected the sample of a scene, got a damaged or foreign file"
-    assert set(scores["scene"]) == {"b"}

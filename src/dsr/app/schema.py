@@ -333,7 +333,7 @@ def register() -> None:
 
 def _present(*names: str) -> str:
     """Return the data sets that are on this machine or embedded, separated by commas; print a note on the others."""
-    from dsr.data.download.collections import CATALOGUE  # noqa: PLC0415 - only a few experiments ask for it
+    from dsr.data.download import CATALOGUE  # noqa: PLC0415 - only a few experiments ask for it
 
     folders = {name: CATALOGUE[name].folders if name in CATALOGUE else () for name in names}
     absent = [name for name in names if not all((data_root() / folder).is_dir() for folder in folders[name])]

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from dsr.cli.commands import add_commands
-from dsr.data.download.collections import Collection
+from dsr.data.download import Collection
 from dsr.doctor.about import version_lines
 from dsr.utils import interruption
 from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, printable, show

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from dsr.app.requests import SHELLS, CompletionRequest
 from dsr.cli import Parser, make_parser
-from dsr.data.download.collections import CATALOGUE
+from dsr.data.download import CATALOGUE
 from dsr.geometry.lights import LIGHT_NAMES
 from dsr.utils.configuration import config_directories, list_choices, list_groups
 

@@ -16,7 +16,7 @@ from dsr.app.requests import (
     DataVerifyRequest,
     DataWhereRequest,
 )
-from dsr.data.download.collections import CATALOGUE, Collection, Item, find
+from dsr.data.download import CATALOGUE, Collection, Item, find
 from dsr.data.download.fetching import absent, checksums_of, expect_address, get, state, verify
 from dsr.methods import weights
 from dsr.utils.console import ConsoleProgress, show

@@ -1,7 +1,5 @@
 """``dataset=arkitscenes``: a tablet's lidar at a ratio of 7.5, with a laser scanner's depth as the truth.
 
-``downsampling=measured scale=native`` takes the lidar's maps as the input.
-
 Baruch et al., "ARKitScenes: A Diverse Real-World Dataset for 3D Indoor Scene Understanding Using Mobile RGB-D Data",
 NeurIPS Datasets and Benchmarks 2021; DATA.md and the READMEs of github.com/apple/ARKitScenes.
 
@@ -18,10 +16,8 @@ to the raw data; where there are none, 60 degrees of horizontal view are assumed
 
 from __future__ import annotations
 
-import functools
-import re
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 
@@ -33,8 +29,7 @@ from dsr.data.frame_files import (
     read_frame,
     read_millimetres,
 )
-from dsr.data.preparation import FrameSet
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import PreparedDataset, SceneSelection, make_records
 from dsr.geometry.camera import ASSUMED_FOV, Camera
 from dsr.io.captures.arkit import find_intrinsics
 from dsr.io.images import read_levels, read_numbers
@@ -44,7 +39,6 @@ from dsr.utils.guards import expect_one_of
 Split = Literal["validation", "training"]
 SPLITS: tuple[Split, ...] = ("validation", "training")
 _SIZE, _SIZE_LR = (1440, 1920), (192, 256)
-_PHOTO = re.compile(r"(\d+_\d+\.\d+)\.png")
 _HIGHEST_CONFIDENCE = 2
 Files = tuple[Path, Path, Path, Path | None, Path | None]
 
@@ -54,7 +48,7 @@ def find_frames(root: Path, split: Split | None = None) -> dict[str, Files]:
     found: dict[str, Files] = {}
     for folder in ("wide", "color"):
         others = ("highres_depth/{}.png", "lowres_depth/{}.png")
-        for place, frame, (photo, truth, measured) in find_beside(root, folder, _PHOTO, others):
+        for place, frame, (photo, truth, measured) in find_beside(root, folder, r"(\d+_\d+\.\d+)\.png", others):
             if split is None or ("Training" in place.resolve().parts) == (split == "training"):
                 confidence = place / "confidence" / photo.name
                 known = confidence if confidence.is_file() else None
@@ -91,25 +85,19 @@ def load_frame(
     height, width = _SIZE
     camera = Camera.from_fov(ASSUMED_FOV, width, height)
     if intrinsics_path is not None:
-        camera = read_intrinsics(intrinsics_path)
+        width_given, height_given, *intrinsics = read_numbers(intrinsics_path, 6).tolist()  # pixel centres at integers
+        if (height_given, width_given) != _SIZE:
+            came = f"{height_given:g} x {width_given:g}"
+            raise ValueError(f"{intrinsics_path}: expected a camera of 1440 x 1920 pixels, got {came}")
+        camera = given_camera(intrinsics, _SIZE, intrinsics_path)
     return Scene(dataset, name, rgb, camera, depth, {width / _SIZE_LR[1]: measured})
 
 
-def read_intrinsics(path: Path) -> Camera:
-    """Return the camera of a ``.pincam`` file, of 1920 x 1440 pixels with their centres at integers."""
-    width, height, *intrinsics = read_numbers(path, 6).tolist()
-    if (height, width) != _SIZE:
-        raise ValueError(f"{path}: expected a camera of 1440 x 1920 pixels, got {height:g} x {width:g}")
-    return given_camera(intrinsics, _SIZE, path)
-
-
 NOTE = f"there is no .pincam file: {ASSUMED_FOV:g} degrees of horizontal view are assumed"
-
-
 DETECTED = ((find_frames, load_frame, "arkitscenes"),)
 
 
-class ARKitScenes(FrameSet):
+class ARKitScenes(PreparedDataset):
     """Frames of ARKitScenes for depth upsampling (Baruch et al., NeurIPS 2021) at their own size, 1920 x 1440."""
 
     def __init__(
@@ -118,10 +106,9 @@ class ARKitScenes(FrameSet):
         expect_one_of("split", split, SPLITS)
         if min_confidence not in range(3):
             raise ValueError(f"min_confidence: expected 0, 1 or 2, got {min_confidence}")
-        find = functools.partial(find_frames, split=split)
-        super().__init__("arkitscenes", root, find, load_frame, scenes, min_confidence=min_confidence)
+        frames = find_frames(Path(root).expanduser(), split)
+        found = make_records(
+            frames, load_frame, "arkitscenes", lambda *files: "" if files[-1] else NOTE, min_confidence=min_confidence
+        )
+        super().__init__("arkitscenes", root, found, scenes)
         self.evaluation = split == "validation"
-
-    def note_of(self, *files: Any) -> str:
-        """Return that the camera is assumed, where it is."""
-        return NOTE if files[-1] is None else ""

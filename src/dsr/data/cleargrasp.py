@@ -4,7 +4,7 @@ Sajjan et al., "ClearGrasp: 3D Shape Estimation of Transparent Objects for Manip
 samples are in github.com/Shreeyak/cleargrasp (Apache 2.0).
 
 ``cleargrasp`` has captures of a RealSense at 1280 x 720, with their depth as the measured map, and of the same scene
-with painted twins in the objects' places, whose depth is the truth: ``downsampling=measured scale=1``.
+with painted twins in the objects' places, whose depth is the truth.
 
     real-val/d435/000000080-transparent-rgb-img.jpg      000000080-transparent-depth-img.exr   metres, 0 or NaN = hole
     real-val/d435/000000080-opaque-depth-img.exr         000000080-mask.png                    not 0: the objects
@@ -30,7 +30,6 @@ Regions of all are ``glass``, the mask of the objects, ``outside``, all the rest
 
 from __future__ import annotations
 
-import functools
 import math
 import re
 from collections.abc import Sequence
@@ -51,9 +50,8 @@ from dsr.data.frame_files import (
     to_depth,
     walk,
 )
-from dsr.data.preparation import FrameSet
 from dsr.data.reference_depth import smooth_levels
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import PreparedDataset, SceneSelection, make_records
 from dsr.geometry.camera import Camera
 from dsr.io.depth_files import read_depth_file
 from dsr.io.images import read_mask
@@ -168,15 +166,14 @@ def read_camera(path: Path) -> Camera:
 DETECTED = ((find_captures, load_capture, "cleargrasp"), (find_renderings, load_rendering, "cleargrasp_synthetic"))
 
 
-class ClearGrasp(FrameSet):
+class ClearGrasp(PreparedDataset):
     """Captures or renderings of ClearGrasp at their own size."""
 
-    note = NOTE
     regions = ("glass", "outside", "edges")
 
     def __init__(self, root: str, synthetic: bool, split: Split | None = None, scenes: SceneSelection = None) -> None:
         expect_one_of("split", split, (*SPLITS, None))
         name, load = ("cleargrasp_synthetic", load_rendering) if synthetic else ("cleargrasp", load_capture)
-        find = functools.partial(find_renderings if synthetic else find_captures, split=split)
-        super().__init__(name, root, find, load, scenes)
+        frames = (find_renderings if synthetic else find_captures)(Path(root).expanduser(), split)
+        super().__init__(name, root, make_records(frames, load, name, NOTE), scenes)
         self.evaluation = split != "train"

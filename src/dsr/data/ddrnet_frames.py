@@ -1,7 +1,7 @@
 """``dataset=ddrnet``: a person before a structured-light camera, at the photo's own size, with fused geometry as truth.
 
-``downsampling=measured scale=1`` takes the sensor's maps as the input. Yan et al., "DDRNet: Depth Map Denoising and
-Refinement for Consumer Depth Cameras Using Cascaded CNNs", ECCV 2018; github.com/neycyanshi/DDRNet.
+Yan et al., "DDRNet: Depth Map Denoising and Refinement for Consumer Depth Cameras Using Cascaded CNNs", ECCV 2018;
+github.com/neycyanshi/DDRNet.
 
     GROUP/color_map/frame_000001.png            the photo, 640 x 480
     GROUP/depth_map/frame_000001.png            the sensor's depth, registered to the photo, 16 bits, mm, 0 = hole
@@ -12,24 +12,21 @@ The camera is that of the authors' losses (src/losses.py), taken as it is: pixel
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 from dsr.data.frame_files import find_beside, name_of, read_frame
-from dsr.data.preparation import FrameSet
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import PreparedDataset, SceneSelection, make_records
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 
 CAMERA = Camera(640, 480, 536.628, 536.606, 310.591, 234.759)
-_PHOTO = re.compile(r"(.+)\.png")
 
 
 def find_frames(root: Path) -> dict[str, tuple[Path, Path, Path]]:
     """Return photos, sensor's and true depth by name "20170907/group1/frame_000001", in order."""
     found = {}
     others = ("depth_map/{}.png", "high_quality_depth/{}.png")
-    for place, frame, (photo, measured, truth) in find_beside(root, "color_map", _PHOTO, others):
+    for place, frame, (photo, measured, truth) in find_beside(root, "color_map", r"(.+)\.png", others):
         found[name_of(root, place, frame)] = (photo, measured, truth)
     return found
 
@@ -43,8 +40,9 @@ def load_frame(rgb_path: Path, measured_path: Path, truth_path: Path, dataset: s
 DETECTED = ((find_frames, load_frame, "ddrnet"),)
 
 
-class DDRNetFrames(FrameSet):
+class DDRNetFrames(PreparedDataset):
     """Frames of Yan et al. (ECCV 2018) at their own size, the sensor's map as measured at x1."""
 
     def __init__(self, root: str, scenes: SceneSelection = None) -> None:
-        super().__init__("ddrnet", root, find_frames, load_frame, scenes)
+        found = make_records(find_frames(Path(root).expanduser()), load_frame, "ddrnet")
+        super().__init__("ddrnet", root, found, scenes)

@@ -16,7 +16,6 @@ from pathlib import Path
 import dsr.data
 from dsr.data import middlebury, nyu
 from dsr.data.folder import load_scene
-from dsr.data.preparation import Frames
 from dsr.sample import Scene
 from dsr.utils.guards import natural_key
 
@@ -37,33 +36,25 @@ def find_scenes(folder: Path) -> Iterator[tuple[str, Loader]]:
         if labelled.is_file():
             for name, arguments in itertools.islice(nyu.find_frames(labelled).items(), 0, None, 100):
                 yield name, functools.partial(nyu.load_frame, *arguments, "nyu", name)
-    for find, load, dataset in _detected():
+    # the renderer of dsr.data.rendered, which has no files, takes half a second to import
+    names = {module.name for module in pkgutil.iter_modules(dsr.data.__path__, "dsr.data.")} - {"dsr.data.rendered"}
+    modules = map(importlib.import_module, sorted(names))
+    for find, load, dataset in itertools.chain.from_iterable(getattr(each, "DETECTED", ()) for each in modules):
         for name, arguments in find(folder).items():
             if not any((path.parent / "camera.json").is_file() for path in arguments if isinstance(path, Path)):
                 yield name, functools.partial(load, *arguments, dataset, name)
 
 
-def _detected() -> Iterator[tuple[Callable[[Path], Frames], Callable[..., Scene], str]]:
-    """Yield what the modules of data sets have in ``DETECTED``."""
-    for module in pkgutil.iter_modules(dsr.data.__path__, "dsr.data."):
-        if module.name == "dsr.data.rendered":  # has no files, and its renderer takes half a second to import
-            continue
-        yield from getattr(importlib.import_module(module.name), "DETECTED", ())
-
-
 def _stereo(place: Path, *, itself: bool) -> Iterator[tuple[str, Loader]]:
     """Yield the Middlebury scenes directly below a folder, and the one that the folder is."""
-    for name, scene in middlebury.find_2014(place).items():
-        yield name, functools.partial(middlebury.load_2014, scene, "middlebury", name)
-    for name, files in middlebury.find_levels(place).items():
-        yield name, _levels(name, files)
+    for name, record in middlebury.records_2014(place, "middlebury").items():
+        yield name, record.load
+    levels = middlebury.find_levels(place)
     if itself and (place / "calib.txt").is_file():
         yield place.name, functools.partial(middlebury.load_2014, place, "middlebury", place.name)
     if itself and any((place / photo).is_file() for photo in _YEARS):
         name = place.resolve().name.casefold()
-        yield name, _levels(name, middlebury.find_levels(place.resolve().parent)[name])
-
-
-def _levels(name: str, files: middlebury.Files) -> Loader:
-    year = _YEARS.get(files.photo.name, 2005)
-    return functools.partial(middlebury.load_levels, files, f"middlebury{year}", name, year)
+        levels[name] = middlebury.find_levels(place.resolve().parent)[name]
+    for name, files in levels.items():
+        year = _YEARS.get(files.photo.name, 2005)
+        yield name, functools.partial(middlebury.load_levels, files, f"middlebury{year}", name, year)

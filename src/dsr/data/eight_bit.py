@@ -16,8 +16,6 @@ Middlebury 1.3 m and 3.0 m, with the camera of 2005 and 2006, three levels to a 
 from __future__ import annotations
 
 import functools
-import re
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -26,8 +24,7 @@ from typing import Literal
 import torch
 
 from dsr.data.frame_files import expect_size, find_beside, in_natural_order, read_picture
-from dsr.data.preparation import FrameSet
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import PreparedDataset, SceneSelection, make_records
 from dsr.geometry.camera import Camera, baseline_times_focal, from_range
 from dsr.io.images import read_levels
 from dsr.sample import Scene, Unit
@@ -44,23 +41,11 @@ class Benchmark:
     baseline: float  # distance of the second camera in metres
     offset: float  # added to levels to give disparity
 
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        """Names of the scenes."""
-        return tuple(f"{self.prefix}_{number:02d}" for number in range(1, self.count + 1))
 
-    def camera(self, height: int, width: int) -> Camera:
-        """Return the invented camera of pictures of a size; disparity of its depth is the level."""
-        centred = Camera.centred(width, height, self.focal)
-        return replace(centred, baseline=self.baseline, doffs=self.offset)
-
-
-BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
-    {
-        "lu": Benchmark("RGBD", 6, 525.0, 0.5, 75.0),
-        "middlebury8": Benchmark("Middlebury", 30, 3740 / 3, 0.48, 200.0),
-    }
-)
+BENCHMARKS = MappingProxyType({
+    "lu": Benchmark("RGBD", 6, 525.0, 0.5, 75.0),
+    "middlebury8": Benchmark("Middlebury", 30, 3740 / 3, 0.48, 200.0),
+})  # fmt: skip
 
 
 def find_frames(root: Path, dataset: str) -> dict[str, tuple[Path, Path]]:
@@ -68,7 +53,7 @@ def find_frames(root: Path, dataset: str) -> dict[str, tuple[Path, Path]]:
     found: dict[str, tuple[Path, Path]] = {}
     prefix = BENCHMARKS[dataset].prefix
     for spelling in ("output", "ouput"):
-        pattern = re.compile(rf"({prefix}_\d{{2}})_{spelling}_color\.png")
+        pattern = rf"({prefix}_\d{{2}})_{spelling}_color\.png"
         for _, frame, (photo, levels) in find_beside(root, "RGB", pattern, ("Depth/{}_output_depth.png",)):
             found.setdefault(frame, (photo, levels))
     return in_natural_order(found)
@@ -79,25 +64,26 @@ def load_frame(rgb_path: Path, levels_path: Path, dataset: str, name: str) -> Sc
     rgb, levels = read_picture(rgb_path), read_levels(levels_path)
     height, width = rgb.shape[1:]
     expect_size(levels_path, levels, (height, width))
-    camera = BENCHMARKS[dataset].camera(height, width)
+    invented = BENCHMARKS[dataset]
+    camera = Camera.centred(width, height, invented.focal)
+    camera = replace(camera, baseline=invented.baseline, doffs=invented.offset)
     depth = from_range(torch.from_numpy(levels).double()[None], camera, "disparity")
     unit = Unit("levels", inverse=True, factor=baseline_times_focal(camera), offset=camera.doffs, limits=(0.0, 255.0))
     return Scene(dataset, name, rgb, camera, depth, unit=unit)
 
 
 NOTE = "depth is not metric: the camera is invented, and levels are read as disparity"
-
-
 DETECTED = tuple((functools.partial(find_frames, dataset=each), load_frame, each) for each in BENCHMARKS)
 
 
-class EightBit(FrameSet):
+class EightBit(PreparedDataset):
     """Six pairs of Lu et al. (CVPR 2014) or thirty of Middlebury 2001 to 2006, at their own size."""
 
-    note = NOTE
     soft_edges = True
 
     def __init__(self, root: str, benchmark: Literal["lu", "middlebury8"], scenes: SceneSelection = None) -> None:
         expect_one_of("benchmark", benchmark, BENCHMARKS)
-        find = functools.partial(find_frames, dataset=benchmark)
-        super().__init__(benchmark, root, find, load_frame, scenes, BENCHMARKS[benchmark].scenes)
+        found = make_records(find_frames(Path(root).expanduser(), benchmark), load_frame, benchmark, NOTE)
+        known = BENCHMARKS[benchmark]
+        named = [f"{known.prefix}_{number:02d}" for number in range(1, known.count + 1)]
+        super().__init__(benchmark, root, found, scenes, named)

@@ -60,10 +60,6 @@ class Folder(SceneSource):
         if unknown := self._without_offset.difference(found):
             raise ValueError(f"without_offset: expected names of scenes in {root}, got {', '.join(sorted(unknown))}")
 
-    def scenes(self) -> list[str]:
-        """Return the names of the scenes, in order."""
-        return list(self._scenes)
-
     def load(self, scene: str) -> Scene:
         """Return one scene."""
         return load_scene(self._root / scene, self.name, offset=scene not in self._without_offset)
@@ -98,8 +94,12 @@ def load_scene(folder: Path, dataset: str, *, offset: bool = True) -> Scene:
             if ratio in measured:
                 raise ValueError(f"{path}: expected one map at x{round_ratio(ratio)}, there is another")
             measured[ratio] = depth_lr
-    path_hr = _find_depth_hr(folder)
-    depth = None if path_hr is None else _read_depth(path_hr, path_hr.stem, description, camera, folder / "mask.png")
+    found = [folder / f"{name}{suffix}" for name in _QUANTITIES for suffix in MAP_SUFFIXES]
+    found = [path for path in found if path.is_file()]
+    if len(found) > 1:
+        names = ", ".join(path.name for path in found)
+        raise ValueError(f"{folder}: expected one high-resolution depth map, got {names}")
+    depth = _read_depth(found[0], found[0].stem, description, camera, folder / "mask.png") if found else None
     if depth is None and not measured:
         names = " or ".join(f"{name}.{{npy,png,tiff,pfm}}" for name in _QUANTITIES)
         raise ValueError(f"{folder}: expected {names}, there is none")
@@ -125,24 +125,15 @@ def _read_measured(path: Path, quantity: str, factor: str, description: CameraFi
     return ratio, _read_depth(path, quantity, description, camera_lr)
 
 
-def _find_depth_hr(folder: Path) -> Path | None:
-    """Return the file of the high-resolution depth, None where there is none."""
-    found = [folder / f"{name}{suffix}" for name in _QUANTITIES for suffix in MAP_SUFFIXES]
-    found = [path for path in found if path.is_file()]
-    if len(found) > 1:
-        raise ValueError(
-            f"{folder}: expected one high-resolution depth map, got {', '.join(path.name for path in found)}"
-        )
-    return found[0] if found else None
-
-
 def _read_depth(
     path: Path, quantity: str, description: CameraFile, camera: Camera, mask_path: Path | None = None
 ) -> Tensor:
     """Return a map as orthogonal depth, (1, H, W) in metres, NaN in holes."""
     values = read_map(path, pixels_beside(camera.height, camera.width))
     expect_size(path, values, (camera.height, camera.width), ", from camera.json")
-    unit = 1.0 if quantity == "disparity" else _depth_unit(path, description)
+    unit = 1.0 if quantity == "disparity" else description.depth_unit
+    if unit is None and path.suffix.lower() == ".png":
+        raise ValueError(f'{path}: expected its unit in camera.json: "depth_unit": "m", "mm" or metres per value')
     values[np.isinf(values)] = np.nan  # infinity stands for an unknown disparity at Middlebury
     if description.hole_value is not None:
         values[values == description.hole_value] = np.nan
@@ -158,18 +149,10 @@ def _read_depth(
             f"{path}: expected positive values, got {low:g} in {np.mean(values <= 0):.2%} of the pixels "
             '(mark holes by NaN, by mask.png, or by "hole_value" in camera.json)'
         )
-    depth = from_range(torch.from_numpy(values)[None] * unit, camera, _range_type(path, quantity, description))
+    metres = torch.from_numpy(values)[None] * (unit or 1.0)
+    depth = from_range(metres, camera, _range_type(path, quantity, description))
     expect_distances(str(path), depth)
     return depth
-
-
-def _depth_unit(path: Path, description: CameraFile) -> float:
-    """Return metres per value of a depth file; PNG files have no default unit."""
-    if description.depth_unit is not None:
-        return description.depth_unit
-    if path.suffix.lower() == ".png":
-        raise ValueError(f'{path}: expected its unit in camera.json: "depth_unit": "m", "mm" or metres per value')
-    return 1.0
 
 
 def _range_type(path: Path, quantity: str, description: CameraFile) -> RangeType:

@@ -24,12 +24,14 @@ NO_CAMERA = f"no camera is published: {ASSUMED_FOV:g} degrees of horizontal view
 Found = TypeVar("Found")
 
 
-def read_picture(path: Path) -> Tensor:
-    """Return a picture of 8 or 16 bits a channel, (3, H, W) float32 in [0, 1]."""
+def read_picture(path: Path, size: Sequence[int] | None = None) -> Tensor:
+    """Return a picture of 8 or 16 bits a channel, (3, H, W) float32 in [0, 1], perhaps of a given size."""
     pixels = read_pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{path}: expected a picture of 8 or 16 bits a channel, got {pixels.dtype}")
     scaled = pixels[..., ::-1].astype(np.float32) / np.iinfo(pixels.dtype).max
+    if size is not None:
+        expect_size(path, scaled[..., 0], size)
     return torch.from_numpy(np.ascontiguousarray(scaled.transpose(2, 0, 1)))
 
 
@@ -136,7 +138,7 @@ def name_of(root: Path, folder: Path, frame: str = "") -> str:
 
 
 def find_beside(
-    root: Path, photos: str, pattern: re.Pattern[str], others: Sequence[str]
+    root: Path, photos: str, pattern: str, others: Sequence[str]
 ) -> Iterator[tuple[Path, str, tuple[Path, ...]]]:
     """Yield the frames of a data set that has its photos in one folder and their maps in folders beside it.
 
@@ -147,7 +149,7 @@ def find_beside(
     for place, below, _ in walk(root):
         if photos in below:
             for photo in sorted((place / photos).iterdir(), key=natural_key):
-                if match := pattern.fullmatch(photo.name):
+                if match := re.fullmatch(pattern, photo.name):
                     files = (photo, *(place / other.format(match[1]) for other in others))
                     if all(path.is_file() for path in files):
                         yield place, match[1], files

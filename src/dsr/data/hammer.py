@@ -1,8 +1,5 @@
 """``dataset=hammer``: tables with glass, metal and other things before three depth cameras, with a scanner's truth.
 
-``downsampling=measured scale=1`` takes the maps of the camera ``dataset.sensor`` as the input: ``d435``, active stereo,
-``tof``, indirect time of flight, or ``l515``, direct time of flight.
-
 Jung et al., "On the Importance of Accurate Geometry Data for Dense 3D Vision Tasks", CVPR 2023, the HAMMER data set;
 README.md of github.com/Junggy/HAMMER-dataset, which states no licence. Scenes 2 to 11 are to train on, 12 to 14 to
 test. As the archive ``_dataset_processed.zip`` has them, by the loaders of others who use it:
@@ -12,20 +9,17 @@ test. As the archive ``_dataset_processed.zip`` has them, by the loaders of othe
     scene12_traj1_1/polarization/depth_d435/000000.png     the camera's depth, warped into the photo, mm, 0 = hole
     scene12_traj1_1/polarization/intrinsics.txt            3 x 3, taken as it is: pixel centres at integers
 
-likewise ``depth_tof`` and ``depth_l515``. The sequences ``scene12_traj1_naked_1`` have the same views without the
-objects.
+likewise ``depth_tof`` and ``depth_l515``. Sequences such as ``scene12_traj1_naked_1`` lack the objects.
 """
 
 from __future__ import annotations
 
-import functools
 import re
 from pathlib import Path
 from typing import Literal, get_args
 
 from dsr.data.frame_files import find_beside, in_natural_order, read_frame, to_camera
-from dsr.data.preparation import FrameSet
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import PreparedDataset, SceneSelection, make_records
 from dsr.io.images import read_numbers
 from dsr.sample import Scene
 from dsr.utils.guards import expect_one_of
@@ -34,7 +28,6 @@ Sensor = Literal["d435", "tof", "l515"]
 Split = Literal["test", "train"]
 TEST = (12, 13, 14)  # numbers of the scenes to test on
 _SEQUENCE = re.compile(r"scene(\d+)_traj\d+(_naked)?_\d+")
-_PHOTO = re.compile(r"(\d+)\.png")
 
 
 def find_frames(
@@ -43,7 +36,7 @@ def find_frames(
     """Return photo, measured and true depth, and intrinsics by name "scene12_traj1_1/000000", in order."""
     found = {}
     others = (f"depth_{sensor}/{{}}.png", "_gt/{}.png", "intrinsics.txt")
-    for place, frame, (photo, measured, truth, intrinsics) in find_beside(root, "rgb", _PHOTO, others):
+    for place, frame, (photo, measured, truth, intrinsics) in find_beside(root, "rgb", r"(\d+)\.png", others):
         sequence = place.resolve().parent.name
         match = _SEQUENCE.fullmatch(sequence)
         if match is None or bool(match[2]) != naked:
@@ -65,7 +58,7 @@ def load_frame(
 DETECTED = ((find_frames, load_frame, "hammer"),)
 
 
-class Hammer(FrameSet):
+class Hammer(PreparedDataset):
     """Frames of HAMMER at their own size, a camera's map as measured at x1; ``naked`` are those without objects."""
 
     def __init__(
@@ -78,6 +71,6 @@ class Hammer(FrameSet):
     ) -> None:
         expect_one_of("sensor", sensor, get_args(Sensor))
         expect_one_of("split", split, get_args(Split))
-        find = functools.partial(find_frames, sensor=sensor, split=split, naked=naked)
-        super().__init__("hammer", root, find, load_frame, scenes)
+        found = make_records(find_frames(Path(root).expanduser(), sensor, split, naked), load_frame, "hammer")
+        super().__init__("hammer", root, found, scenes)
         self.evaluation = split == "test"

@@ -19,7 +19,6 @@ Regions are ``planes``, numbered from 1 (walls, then tables, then floors), and `
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -38,8 +37,7 @@ from dsr.data.frame_files import (
     walk,
 )
 from dsr.data.matlab import read_variables
-from dsr.data.preparation import PreparedDataset, make_records
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import PreparedDataset, SceneSelection, make_records
 from dsr.geometry.camera import Camera
 from dsr.io.images import read_levels
 from dsr.sample import Scene
@@ -51,7 +49,6 @@ FARTHEST = 50.0  # depth of the largest value in pictures, metres
 _VALID = ("mask_invalid", "mask_transp")
 _PLANES = ("mask_wall", "mask_table", "mask_floor")
 _MASKS = (*_VALID, "edges", *_PLANES)
-_PHOTO = re.compile(r"(.+)\.png")
 Pictures = tuple[Path, Path, Path, *tuple[Path | None, ...]]
 
 
@@ -68,7 +65,7 @@ def find_pictures(root: Path) -> dict[str, Pictures]:
     """Return the files of scenes in folders, the first arguments of :func:`load_pictures`, by name, in order."""
     found: dict[str, Pictures] = {}
     needed = ("depth/{}.png", "calib/{}.txt", *(f"{mask}/{{}}.png" for mask in _VALID))
-    for place, name, (photo, depth, calibration, *_) in find_beside(root, "rgb", _PHOTO, needed):
+    for place, name, (photo, depth, calibration, *_) in find_beside(root, "rgb", r"(.+)\.png", needed):
         masks = (place / mask / photo.name for mask in _MASKS)
         found[name] = (photo, depth, calibration, *(path if path.is_file() else None for path in masks))
     return in_natural_order(found)
@@ -98,10 +95,9 @@ def load_matrices(path: Path, dataset: str, name: str) -> Scene:
 def load_pictures(rgb_path: Path, depth_path: Path, calibration_path: Path, *paths: Path | str | None) -> Scene:
     """Return the scene of pictures; ``paths`` are the files of :data:`_MASKS`, then the names of data set and scene."""
     *mask_paths, dataset, name = paths
-    rgb, depth = read_picture(rgb_path), read_16bit(depth_path)
+    rgb, depth = read_picture(rgb_path, SIZE), read_16bit(depth_path)
     given = {key: path for key, path in zip(_MASKS, mask_paths, strict=True) if isinstance(path, Path)}
     masks = {key: read_levels(path) for key, path in given.items()}
-    expect_size(rgb_path, rgb, SIZE)
     for path, image in ((depth_path, depth), *((given[key], mask) for key, mask in masks.items())):
         expect_size(path, image, SIZE)
     text = read_text(calibration_path)

@@ -22,8 +22,7 @@ from types import MappingProxyType
 from torch import Tensor
 
 from dsr.data.frame_files import expect_size, name_of, read_16bit, read_picture, to_depth, walk
-from dsr.data.preparation import Frames, FrameSet, Preparation, rename_frames
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import Preparation, PreparedDataset, SceneSelection, make_records, rename_frames
 from dsr.geometry.camera import from_range
 from dsr.io.depth_files import ICL_CAMERA as CAMERA
 from dsr.io.depth_files import read_depth_file
@@ -31,7 +30,7 @@ from dsr.sample import Scene
 
 FARTHEST = 100.0  # largest depth in metres; longer rays have hit nothing
 LEVELS = 5000  # levels per metre of the depth pictures
-_RENDERED = re.compile(r"scene_00_(\d+)\.depth")
+_RENDERED, _NUMBER = re.compile(r"scene_00_(\d+)\.depth"), re.compile(r"\d{1,9}")
 _SIZE = (480, 640)
 
 
@@ -41,7 +40,10 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
     for folder, below, files in walk(root):
         if "rgb" in below and "depth" in below:
             below[:] = [name for name in below if name not in ("rgb", "depth")]
-            colours, depths = _numbered(folder / "rgb"), _numbered(folder / "depth")
+            colours, depths = (
+                {int(path.stem): path for path in (folder / kind).glob("*.png") if _NUMBER.fullmatch(path.stem)}
+                for kind in ("rgb", "depth")
+            )
             for number in sorted(colours.keys() & depths.keys()):
                 found[name_of(root, folder, f"{number:04d}")] = (colours[number], depths[number])
         if "rgb.png" in files and "depth.png" in files:
@@ -64,14 +66,7 @@ def read_depth(path: Path) -> Tensor:
 
 def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
     """Return one frame at 640 x 480."""
-    rgb = read_picture(rgb_path)
-    expect_size(rgb_path, rgb, _SIZE)
-    return Scene(dataset, name, rgb, CAMERA, read_depth(depth_path))
-
-
-def _numbered(folder: Path) -> dict[int, Path]:
-    """Return the pictures of a folder by number."""
-    return {int(path.stem): path for path in folder.glob("*.png") if re.fullmatch(r"\d{1,9}", path.stem)}
+    return Scene(dataset, name, read_picture(rgb_path, _SIZE), CAMERA, read_depth(depth_path))
 
 
 FRAMES = MappingProxyType(
@@ -84,12 +79,10 @@ FRAMES = MappingProxyType(
         "displays": "office_room_traj2/0300",
     }
 )
-
-
 DETECTED = ((find_frames, load_frame, "icl"),)
 
 
-class ICL(FrameSet):
+class ICL(PreparedDataset):
     """Frames of ICL-NUIM; ``frames`` says which frame each of the paper's names stands for."""
 
     def __init__(
@@ -100,7 +93,5 @@ class ICL(FrameSet):
         crop: float = 0.5,
         frames: Mapping[str, str] = FRAMES,
     ) -> None:
-        def find(folder: Path) -> Frames:
-            return rename_frames(find_frames(folder), frames)
-
-        super().__init__("icl", root, find, load_frame, scenes, tuple(FRAMES), Preparation(size, crop))
+        found = make_records(rename_frames(find_frames(Path(root).expanduser()), frames), load_frame, "icl")
+        super().__init__("icl", root, found, scenes, tuple(FRAMES), Preparation(size, crop))

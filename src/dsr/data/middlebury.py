@@ -32,11 +32,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.data.download.collections import CATALOGUE
+from dsr.data.download import CATALOGUE
 from dsr.data.frame_files import expect_size, read_picture
-from dsr.data.preparation import Preparation, PreparedDataset, SceneRecord
 from dsr.data.reference_depth import smooth_levels
-from dsr.data.scene_source import WITHOUT_OFFSET, SceneSelection
+from dsr.data.scene_source import WITHOUT_OFFSET, Preparation, PreparedDataset, SceneRecord, SceneSelection
 from dsr.geometry.camera import Camera, from_range
 from dsr.io.images import read_levels, read_map
 from dsr.sample import Scene
@@ -73,9 +72,8 @@ def find_levels(root: Path) -> dict[str, Files]:
 
     ``NAME/view1.png``, ``NAME/im2.png`` or ``.ppm`` with their disparity, or ``NAME_color.png`` and ``NAME_big.png``.
     """
-    pairs = (("view1.png", "disp1.png"), ("im2.png", "disp2.png"), ("im2.ppm", "disp2.pgm"))
     found: dict[str, Files] = {}
-    for photo, disparity in pairs:
+    for photo, disparity in (("view1.png", "disp1.png"), ("im2.png", "disp2.png"), ("im2.ppm", "disp2.pgm")):
         for path in sorted(root.glob(f"*/{photo}"), key=natural_key):
             shift = path.with_name("dmin.txt")
             files = Files(path, path.with_name(disparity), shift if shift.is_file() else None, {})
@@ -96,22 +94,38 @@ def load_2014(folder: Path, dataset: str, name: str, *, offset: bool = True) -> 
     path = folder / "disp0.pfm"
     if not path.is_file() and (folder / "disp0GT.pfm").is_file():
         path = folder / "disp0GT.pfm"
-    values = read_map(path)
-    expect_size(path, values, (camera.height, camera.width))
+    values, size = read_map(path), (camera.height, camera.width)
+    expect_size(path, values, size)
     values[~np.isfinite(values)] = np.nan
     low = -camera.doffs if offset else 0.0
     if np.nanmin(values, initial=np.inf) <= low:
         raise ValueError(f"{path}: expected disparities above {low:g} pixels, got {np.nanmin(values):g}")
     if not offset:
         camera = replace(camera, doffs=0.0)
-    return Scene(dataset, name, _photo(folder / "im0.png", camera), camera, _depth(path, values, camera))
+    rgb = read_picture(folder / "im0.png", size)
+    return Scene(dataset, name, rgb, camera, _depth(path, values, camera))
 
 
 def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: bool = True) -> Scene:
     """Return a scene of 2001 to 2006; ``smooth`` removes the steps of the rounding to levels."""
     levels = read_levels(files.disparity).astype(np.float64)
     height, width = levels.shape
-    camera, per_pixel = _levels_camera(files, year, height, width)
+    cx, cy = (width - 1) / 2, (height - 1) / 2
+    if year in (2001, 2003):  # the camera is Teddy's
+        camera, per_pixel = Camera(width, height, 1500.0, 1500.0, 199.0, 187.0, 0.08, 52.0), 4
+        if year == 2001:
+            camera, per_pixel = replace(camera, cx=cx, cy=cy), 8
+    else:
+        per_pixel = round(_FULL_HEIGHT / height)
+        if per_pixel not in (1, 2, 3):
+            raise ValueError(
+                f"{files.disparity}: expected a height near {_FULL_HEIGHT}, a half or a third, got {height}"
+            )
+        shift = _ASSUMED_SHIFT
+        if files.shift is not None:
+            shift = _number(files.shift, "dmin", read_text(files.shift).strip())
+        focal = _FULL_FOCAL / per_pixel
+        camera = Camera(width, height, focal, focal, cx, cy, _BASELINE, shift / per_pixel)
     levels[levels == 0] = np.nan
     depth = _depth(files.disparity, (smooth_levels(levels) if smooth else levels) / per_pixel, camera)
     measured: dict[float, Tensor] = {}
@@ -121,7 +135,7 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
         expect_size(path, values, (camera_lr.height, camera_lr.width))
         values[values == 0] = np.nan
         measured[factor] = _depth(path, values / (per_pixel * factor), camera_lr)
-    return Scene(dataset, name, _photo(files.photo, camera), camera, depth, measured)
+    return Scene(dataset, name, read_picture(files.photo, (height, width)), camera, depth, measured)
 
 
 def read_calibration(path: Path) -> Camera:
@@ -146,33 +160,11 @@ def _number(path: Path, key: str, text: str) -> float:
     return value
 
 
-def _photo(path: Path, camera: Camera) -> Tensor:
-    rgb = read_picture(path)
-    expect_size(path, rgb, (camera.height, camera.width))
-    return rgb
-
-
 def _depth(path: Path, disparity: np.ndarray, camera: Camera) -> Tensor:
     """Return the depth of a disparity map, (1, H, W)."""
     if np.isnan(disparity).all():
         raise ValueError(f"{path}: expected at least one known disparity, all are unknown")
     return from_range(torch.from_numpy(disparity)[None], camera, "disparity")
-
-
-def _levels_camera(files: Files, year: int, height: int, width: int) -> tuple[Camera, float]:
-    """Return the camera of a data set of levels at a map's size, and levels per pixel."""
-    cx, cy = (width - 1) / 2, (height - 1) / 2
-    if year in (2001, 2003):  # Teddy's
-        camera = Camera(width, height, 1500.0, 1500.0, 199.0, 187.0, 0.08, 52.0)
-        return (camera, 4) if year == 2003 else (replace(camera, cx=cx, cy=cy), 8)
-    per_pixel = round(_FULL_HEIGHT / height)
-    if per_pixel not in (1, 2, 3):
-        raise ValueError(f"{files.disparity}: expected a height near {_FULL_HEIGHT}, a half or a third, got {height}")
-    shift = _ASSUMED_SHIFT
-    if files.shift is not None:
-        shift = _number(files.shift, "dmin", read_text(files.shift).strip())
-    focal = _FULL_FOCAL / per_pixel
-    return Camera(width, height, focal, focal, cx, cy, _BASELINE, shift / per_pixel), per_pixel
 
 
 def _scenes(dataset: str, folder: str) -> tuple[str, ...]:
@@ -221,8 +213,7 @@ class MiddleburyLevels(PreparedDataset):
         expect_one_of("year", year, SCENES)
         name = f"middlebury{year}"
         found = records_levels(Path(root).expanduser(), name, year, smooth=smooth)
-        preparation = Preparation(size, crop, fill=tuple(fill))
-        super().__init__(name, root, found, scenes, SCENES[year], preparation)
+        super().__init__(name, root, found, scenes, SCENES[year], Preparation(size, crop, fill=tuple(fill)))
 
 
 class MiddleburyTrain(PreparedDataset):
@@ -264,11 +255,9 @@ def records_levels(folder: Path, dataset: str, year: int, *, smooth: bool = True
     """Return the records of the scenes of 2001 to 2006 on disk, with notes of those whose depth is not metric."""
     records = {}
     for name, files in find_levels(folder).items():
-        note = ""
+        note = "" if files.shift else "depth is not metric: there is no dmin.txt, the shift of Art is assumed"
         if year in (2001, 2003):
             note = "depth is not metric: no camera was published, that of Teddy in the evaluation kit is assumed"
-        elif files.shift is None:
-            note = "depth is not metric: there is no dmin.txt, the shift of Art is assumed"
         paths = tuple(path for path in (files.photo, files.disparity, files.shift, *files.measured.values()) if path)
         load = functools.partial(load_levels, files, dataset, name, year, smooth=smooth)
         records[name] = SceneRecord(paths, load, settings="" if smooth else "terraces", note=note)

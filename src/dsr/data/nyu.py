@@ -17,7 +17,6 @@ al., CVPR 2022) has the latter as files, ``RGB/1000.jpg`` and ``Depth/1000.npy``
 from __future__ import annotations
 
 import contextlib
-import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -29,8 +28,7 @@ import torch
 
 from dsr.data.frame_files import expect_size, find_beside, in_natural_order, read_picture, to_depth
 from dsr.data.matlab import expect_own_values
-from dsr.data.preparation import Preparation, PreparedDataset, make_records
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import Preparation, PreparedDataset, SceneSelection, make_records
 from dsr.geometry.camera import Camera
 from dsr.io.images import read_map
 from dsr.sample import Scene
@@ -40,7 +38,6 @@ CAMERA = Camera(640, 480, 518.85790117450188, 519.46961112127485, 325.5824494111
 BORDER = (44, 40, 427, 561)  # of the window that the projected depth covers: first row and column, height, width
 Split = Literal["train", "test"]
 SPLITS = MappingProxyType({"train": range(1, 1001), "test": range(1001, 1450)})  # numbers of the frames
-_PHOTO = re.compile(r"(\d{1,4})\.jpg")
 _FRAME = MappingProxyType({
     "images": ((3, 640, 480), np.dtype(np.uint8)),
     "depths": ((640, 480), np.dtype(np.float32)),
@@ -74,7 +71,7 @@ def load_frame(path: Path, number: int, dataset: str, name: str, *, filled: bool
 def find_files(root: Path) -> dict[str, tuple[Path, Path]]:
     """Return photos and depths in files of their own by the frame's name: ``RGB/1000.jpg`` is "1001"."""
     found: dict[str, tuple[Path, Path]] = {}
-    for _, number, (photo, depth) in find_beside(root, "RGB", _PHOTO, ("Depth/{}.npy",)):
+    for _, number, (photo, depth) in find_beside(root, "RGB", r"(\d{1,4})\.jpg", ("Depth/{}.npy",)):
         found.setdefault(f"{int(number) + 1:04d}", (photo, depth))
     return in_natural_order(found)
 
@@ -82,8 +79,7 @@ def find_files(root: Path) -> dict[str, tuple[Path, Path]]:
 def load_files(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
     """Return one frame of files of their own, with its border and the filled depth."""
     size = (CAMERA.height, CAMERA.width)
-    rgb, depth = read_picture(rgb_path), to_depth(depth_path, read_map(depth_path))
-    expect_size(rgb_path, rgb, size)
+    rgb, depth = read_picture(rgb_path, size), to_depth(depth_path, read_map(depth_path))
     expect_size(depth_path, depth, size)
     return Scene(dataset, name, rgb, CAMERA, depth)
 
@@ -95,22 +91,19 @@ def _opened(path: Path) -> Iterator[Mapping[str, h5py.Dataset]]:
     with refusing(f"{path}: expected a MATLAB 7.3 (HDF5) file, got {size} bytes damaged or foreign", OSError):
         file = h5py.File(path, "r")
     with file:
-        yield {key: _checked(path, file, key) for key in _FRAME}
-
-
-def _checked(path: Path, file: h5py.File, key: str) -> h5py.Dataset:
-    """Return one of the arrays, if it has the shape and type of its frames and as many as the images."""
-    shape, dtype = _FRAME[key]
-    # damaged inside: h5py raises KeyError, RuntimeError, OSError, ...
-    with refusing(f"{path}: expected the array {key}, got a damaged or foreign file", Exception):
-        array, count = file[key], file["images"].shape[0]
-        came = (array.dtype, array.shape)
-    with naming(f"{path}: expected the array {key}"):
-        expect_own_values(array)
-    if came != (dtype, (count, *shape)):
-        sizes = ", ".join(map(str, shape))
-        raise ValueError(f"{path}: {key}: expected {dtype} (frames, {sizes}), got {came[0]} {came[1]}")
-    return array
+        arrays = {}
+        for key, (shape, dtype) in _FRAME.items():
+            # damaged inside: h5py raises KeyError, RuntimeError, OSError, ...
+            with refusing(f"{path}: expected the array {key}, got a damaged or foreign file", Exception):
+                array, count = file[key], file["images"].shape[0]
+                came = (array.dtype, array.shape)
+            with naming(f"{path}: expected the array {key}"):
+                expect_own_values(array)
+            if came != (dtype, (count, *shape)):
+                sizes = ", ".join(map(str, shape))
+                raise ValueError(f"{path}: {key}: expected {dtype} (frames, {sizes}), got {came[0]} {came[1]}")
+            arrays[key] = array
+        yield arrays
 
 
 DETECTED = ((find_files, load_files, "nyu"),)

@@ -143,18 +143,12 @@ def inpaint_depth(depth: Tensor) -> Tensor:
         window = tuple(slice(max(side.start - 1, 0), side.stop + 1) for side in place)
         hole = labels[window] == label
         rim = ndimage.binary_dilation(hole) & ~holes[window]
-        used = rim & (inverse[window] <= _farther_part(inverse[window][rim]))
+        beside = np.sort(inverse[window][rim])
+        gaps = np.diff(beside)
+        stepped = gaps.size and gaps.max() > _STEP * beside[0]  # the rim's part beyond a depth step is used
+        used = rim & (inverse[window] <= beside[gaps.argmax() if stepped else -1])
         inverse[window][hole] = _solve_laplace(np.where(used, inverse[window], 0), hole, used)
     return torch.from_numpy(1 / inverse)[None]
-
-
-def _farther_part(rim: np.ndarray) -> float:
-    """Return the largest inverse depth of the rim's part beyond a depth step, or of the whole rim if it has none."""
-    values = np.sort(rim)
-    gaps = np.diff(values)
-    if not gaps.size or gaps.max() <= _STEP * values[0]:
-        return float(values[-1])
-    return float(values[gaps.argmax()])
 
 
 def _solve_laplace(values: np.ndarray, hole: np.ndarray, rim: np.ndarray) -> np.ndarray:
@@ -201,17 +195,11 @@ def smooth_levels(levels: np.ndarray, largest_step: int = 2) -> np.ndarray:
     weight = _ANCHOR + np.bincount(np.concatenate((first[level], second[level])), minlength=own.size)
     weight += _CONTOUR * np.bincount(ends, minlength=own.size)
     right = _ANCHOR * own + _CONTOUR * np.bincount(ends, values, minlength=own.size)
+    # weight x - (sum of x over the neighbours) = right, by conjugate gradients
+    rows, columns = np.concatenate((first[level], second[level])), np.concatenate((second[level], first[level]))
+    coupling = sparse.csr_matrix((np.ones(rows.size), (rows, columns)), (own.size, own.size))
+    jacobi = sparse.diags(1 / weight)
+    solution, _ = linalg.cg(sparse.diags(weight) - coupling, right, own, rtol=_TOLERANCE, maxiter=2000, M=jacobi)
     result = np.full(levels.shape, np.nan)
-    result[known] = np.clip(_solve(weight, first[level], second[level], right, own), own - 0.5, own + 0.5)
+    result[known] = np.clip(solution, own - 0.5, own + 0.5)
     return result
-
-
-def _solve(
-    weight: np.ndarray, first: np.ndarray, second: np.ndarray, right: np.ndarray, start: np.ndarray
-) -> np.ndarray:
-    """Solve weight x - (sum of x over the neighbours) = right by conjugate gradients."""
-    rows, columns = np.concatenate((first, second)), np.concatenate((second, first))
-    coupling = sparse.csr_matrix((np.ones(rows.size), (rows, columns)), (start.size, start.size))
-    matrix = sparse.diags(weight) - coupling
-    solution, _ = linalg.cg(matrix, right, start, rtol=_TOLERANCE, maxiter=2000, M=sparse.diags(1 / weight))
-    return np.asarray(solution)

@@ -1,7 +1,7 @@
 """``dataset=procedural``, random scenes to train on, and ``dataset=simgeo``, scenes like the paper's: rendered here.
 
 The paper's sixth scene, Lucy, replaces the statue where ``root/lucy`` holds it in the layout of
-:mod:`dsr.data.folder`. Renderings are cached, see :func:`dsr.synthetic.rendering.cache_directory`.
+:mod:`dsr.data.folder`. Renderings are cached, see :func:`dsr.synthetic.cache_directory`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from pathlib import Path
 from dsr.data.folder import Folder
 from dsr.data.scene_source import SceneSelection, SceneSource, select_scenes
 from dsr.sample import Scene
+from dsr.synthetic import Rendering, cache_directory, expect_room_for, load_or_render
 from dsr.synthetic.procedural.random_scene import PROCEDURAL_VERSION, render_random_scene
-from dsr.synthetic.rendering import Rendering, cache_directory, expect_room_for, load_or_render
 from dsr.synthetic.simgeo import SCENES, SCENES_VERSION, render_scene
 from dsr.utils.processes import Pool
 from dsr.utils.progress import SILENT
@@ -35,11 +35,9 @@ class Procedural(SceneSource):
                 f"dataset: expected count at least 1, size at least 32, seed at least 0; got {count}, {size}, {seed}"
             )
         expect_room_for(size)
-        self._count, self._size, self._seed = count, size, seed
-
-    def scenes(self) -> list[str]:
-        """Return the names of the scenes: their numbers."""
-        return [f"{index:05d}" for index in range(self._count)]
+        self._size, self._seed = size, seed
+        self._series = f"procedural-v{PROCEDURAL_VERSION}-{seed}-{size}"
+        self._scenes = [f"{index:05d}" for index in range(count)]
 
     def load(self, scene: str) -> Scene:
         """Return one scene."""
@@ -47,7 +45,7 @@ class Procedural(SceneSource):
 
     def fingerprint(self, scene: str) -> str:
         """Return the version, seed, size and number that determine the scene."""
-        return f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}-{scene}"
+        return f"{self._series}-{scene}"
 
     def prepare(self, scenes: Sequence[str], say: Callable[[str], None] = SILENT.say) -> Iterable[str]:
         """Render scenes that are not in the cache, and yield the name of each that is ready.
@@ -74,7 +72,7 @@ class Procedural(SceneSource):
         return load_or_render(self._path(scene), lambda: render_random_scene(self._seed, int(scene), self._size))
 
     def _path(self, scene: str) -> Path:
-        return Path(f"procedural-v{PROCEDURAL_VERSION}-{self._seed}-{self._size}", f"{scene}.npz")
+        return Path(self._series, f"{scene}.npz")
 
 
 class SimGeo(SceneSource):
@@ -94,10 +92,6 @@ class SimGeo(SceneSource):
             self._lucy = Folder(root, ["lucy"], self.name)
             available[available.index("statue")] = "lucy"
         self._scenes = select_scenes(available, scenes)
-
-    def scenes(self) -> list[str]:
-        """Return the names of the scenes, in order."""
-        return list(self._scenes)
 
     def load(self, scene: str) -> Scene:
         """Return one scene."""

@@ -1,7 +1,6 @@
 """``dataset=rgbdd`` and ``dataset=rgbdd_real``: a photo and two time-of-flight sensors (He et al., CVPR 2021).
 
-``rgbdd`` has the industrial sensor's depth to downsample, ``rgbdd_real`` that of a phone beside it, which
-``downsampling=measured scale=native`` takes as the input, at a ratio of 2.667.
+``rgbdd`` has the industrial sensor's depth to downsample, ``rgbdd_real`` that of a phone beside it.
 
 He et al., "Towards Fast and Accurate Real-World Depth Super-Resolution: Benchmark Dataset and Baseline", CVPR 2021;
 github.com/lingzhi96/RGB-D-D-Dataset. As its owners hand it out:
@@ -20,9 +19,6 @@ No camera is published; 60 degrees of horizontal view are assumed.
 
 from __future__ import annotations
 
-import functools
-import re
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -36,8 +32,7 @@ from dsr.data.frame_files import (
     read_millimetres,
     walk,
 )
-from dsr.data.preparation import FrameSet
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import PreparedDataset, SceneSelection, make_records
 from dsr.sample import Scene
 from dsr.utils.guards import expect_one_of
 
@@ -45,7 +40,6 @@ Split = Literal["test", "train"]
 COUNTS = {"test": 405, "train": 2215}  # numbers of scenes
 RATIO = 8 / 3  # of the photo's size and that of the phone's depth
 Files = tuple[Path, ...]
-_PHOTO = re.compile(r"(\d+)_RGB\.jpg")
 _PARTS = ("models", "plants", "portraits")
 _DEPTH, _MEASURED = "{0}_HR_gt.png", "{0}_LR_fill_depth.png"
 
@@ -53,12 +47,16 @@ _DEPTH, _MEASURED = "{0}_HR_gt.png", "{0}_LR_fill_depth.png"
 def find_frames(root: Path, split: Split | None = None, measured: bool = False) -> dict[str, Files]:
     """Return photos, true depth and, if ``measured``, the phone's depth, by their number "20200509112638", in order."""
     found: dict[str, Files] = {}
-    for name, files in _find_owners_layout(root, split, measured=measured):
-        found.setdefault(name, files)
+    names = ("{0}_RGB.jpg", _DEPTH, _MEASURED)[: 3 if measured else 2]
+    parts = [f"{part}_{each}" for part in _PARTS for each in COUNTS if split in (None, each)]
+    for folder, _, files in walk(root):  # as its owners hand it out
+        wanted = [name.format(folder.name) for name in names]
+        if folder.parent.name in parts and set(wanted) <= set(files):
+            found.setdefault(folder.name, tuple(folder / name for name in wanted))
     if split in (None, "test"):  # those in circulation
         others = (f"Depth/{_DEPTH}", f"DepthLR/{_MEASURED}")[: 2 if measured else 1]
-        for _, name, files in find_beside(root, "RGB", _PHOTO, others):
-            found.setdefault(name, files)
+        for _, number, paths in find_beside(root, "RGB", r"(\d+)_RGB\.jpg", others):
+            found.setdefault(number, paths)
     return in_natural_order(found)
 
 
@@ -70,29 +68,17 @@ def load_measured_frame(rgb_path: Path, depth_path: Path, measured_path: Path, d
     return replace(scene, measured={scene.camera.width / size[1]: measured})
 
 
-def _find_owners_layout(root: Path, split: Split | None, *, measured: bool) -> Iterator[tuple[str, Files]]:
-    """Yield the number and the files of the images that have a folder each."""
-    names = ("{0}_RGB.jpg", _DEPTH, _MEASURED)[: 3 if measured else 2]
-    folders = [f"{part}_{each}" for part in _PARTS for each in COUNTS if split in (None, each)]
-    for folder, _, files in walk(root):
-        if folder.parent.name in folders:
-            wanted = [name.format(folder.name) for name in names]
-            if set(wanted) <= set(files):
-                yield folder.name, tuple(folder / name for name in wanted)
-
-
 DETECTED = ((find_frames, load_pair, "rgbdd"),)
 
 
-class RGBDD(FrameSet):
+class RGBDD(PreparedDataset):
     """Images of RGB-D-D at their own size; ``real`` ones have the phone's depth as the measured map."""
 
-    note = NO_CAMERA
     soft_edges = True
 
     def __init__(self, root: str, real: bool, split: Split = "test", scenes: SceneSelection = None) -> None:
         expect_one_of("split", split, COUNTS)
         name, load = ("rgbdd_real", load_measured_frame) if real else ("rgbdd", load_pair)
-        find = functools.partial(find_frames, split=split, measured=real)
-        super().__init__(name, root, find, load, scenes, count=COUNTS[split])
+        found = make_records(find_frames(Path(root).expanduser(), split, real), load, name, NO_CAMERA)
+        super().__init__(name, root, found, scenes, count=COUNTS[split])
         self.evaluation = split == "test"

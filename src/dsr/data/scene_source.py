@@ -1,20 +1,39 @@
-"""The base class of data sets."""
+"""The base classes of data sets: scenes by name, resized and cropped once and kept in the cache.
+
+The name of a cached file contains a hash of the scene's files, the settings, and :data:`dsr.utils.versions.SCENES`. So
+a change of any of them prepares the scene again.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import contextlib
+import functools
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Literal
 
+import torch
+
+from dsr.data.reference_depth import fit, inpaint_depth
 from dsr.sample import Scene
-from dsr.utils.guards import readable
-from dsr.utils.progress import Progress
+from dsr.synthetic import Rendering, cache_directory, expect_room_for, load_or_render
+from dsr.utils.guards import derived, readable
+from dsr.utils.progress import SILENT, Progress
+from dsr.utils.versions import SCENES, hash_once
 
+# Names of scenes; None for those that belong to the data set, ``found`` for all that are on disk
 SceneSelection = Sequence[str] | Literal["found"] | None
-"""Names of scenes; None for those that belong to the data set, ``found`` for all that are on disk."""
-
+Frames = Mapping[str, tuple[Any, ...]]  # arguments of a function that loads a frame, by the frame's name
+# Note of a scene whose ``doffs`` is replaced by 0: z = baseline fx / d instead of baseline fx / (d + doffs)
 WITHOUT_OFFSET = "depth is not metric: the disparity offset is left out, as in the paper"
-"""Note of a scene whose ``doffs`` is replaced by 0: z = baseline fx / d instead of baseline fx / (d + doffs)."""
-_MAX_LISTED = 60
+_MOST_MISSING, _MOST_KNOWN = 30, 60  # numbers of scenes that messages name
+_MIN_SIZE = 32
+_MAX_HASHED = 1 << 28  # largest size in bytes of files whose content is hashed
 
 
 class SceneSource:
@@ -32,10 +51,11 @@ class SceneSource:
     evaluation: bool
     regions: tuple[str, ...] = ()
     soft_edges: bool = False
+    _scenes: Sequence[str]
 
     def scenes(self) -> list[str]:
         """Return the names of the scenes, in order."""
-        raise NotImplementedError
+        return list(self._scenes)
 
     def load(self, scene: str) -> Scene:
         """Return one scene, or raise a ValueError that names a file that is missing or damaged."""
@@ -71,11 +91,7 @@ class SceneSubset(SceneSource):
     def __init__(self, source: SceneSource, names: Sequence[str]) -> None:
         self.name, self.evaluation = source.name, source.evaluation
         self.regions, self.soft_edges = source.regions, source.soft_edges
-        self._source, self._names = source, list(names)
-
-    def scenes(self) -> list[str]:
-        """Return the names of the scenes, in order."""
-        return list(self._names)
+        self._source, self._scenes = source, names
 
     def load(self, scene: str) -> Scene:
         """Return one scene."""
@@ -86,19 +102,15 @@ class SceneSubset(SceneSource):
         return self._source.fingerprint(scene)
 
 
-class _Outside(SceneSource):
-    """A data set of others, which has members of :class:`SceneSource` and does not derive from it."""
-
-    def __init__(self, made: Any) -> None:
-        members = ("name", "evaluation", "regions", "soft_edges", "scenes", "load", "fingerprint", "content", "prepare")
-        for member in members:
-            if hasattr(made, member):
-                setattr(self, member, getattr(made, member))
-
-
 def as_source(made: Any) -> SceneSource:
     """Return what a node of the configuration makes as a data set, with the defaults of what it leaves out."""
-    return made if isinstance(made, SceneSource) else _Outside(made)
+    if isinstance(made, SceneSource):
+        return made
+    source = SceneSource()
+    for member in ("name", "evaluation", *vars(SceneSource)):
+        if not member.startswith("_") and hasattr(made, member):
+            setattr(source, member, getattr(made, member))
+    return source
 
 
 def select_scenes(available: Sequence[str], wanted: SceneSelection) -> list[str]:
@@ -110,11 +122,178 @@ def select_scenes(available: Sequence[str], wanted: SceneSelection) -> list[str]
         raise ValueError(f"scenes: expected names, each once, or null for all; got {came}")
     for name in wanted or ():
         if name not in available:
-            rest = f", ... ({len(available)} in all)" if len(available) > _MAX_LISTED else ""
-            some = ", ".join(available[:_MAX_LISTED])
+            rest = f", ... ({len(available)} in all)" if len(available) > _MOST_KNOWN else ""
+            some = ", ".join(available[:_MOST_KNOWN])
             raise ValueError(f"scenes: {name!r} is not there; expected some of {some}{rest}")
     chosen = list(available) if wanted is None else list(wanted)
     for name in chosen:
         if name != readable(name):
             raise ValueError(f"scenes: expected names in UTF-8, got {name!r}; rename it, or name other scenes")
     return chosen
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """A scene on disk."""
+
+    files: tuple[Path, ...]  # that the scene is read from; a folder stands for all files in it
+    load: Callable[[], Scene]  # at its original size
+    frame: str = ""  # part of the files that holds the scene, where they hold several
+    settings: str = ""  # how the files are read
+    note: str = ""  # for readers of the scene's scores
+
+
+def make_records(
+    frames: Frames,
+    load: Callable[..., Scene],
+    dataset: str,
+    note: str | Callable[..., str] = "",
+    **settings: Any,
+) -> dict[str, SceneRecord]:
+    """Return the records of frames on disk, by their names with _ in place of /.
+
+    ``load`` gets a frame's entry of ``frames``, the names of data set and scene, and ``settings``; ``note`` the entry.
+    """
+    records = {}
+    for frame, arguments in frames.items():
+        name = frame.replace("/", "_")
+        files = tuple(path for path in arguments if isinstance(path, Path))
+        which = json.dumps([each for each in arguments if not isinstance(each, Path)])
+        read = functools.partial(load, *arguments, dataset, name, **settings)
+        told = note if isinstance(note, str) else note(*arguments)
+        records[name] = SceneRecord(files, read, which, json.dumps(settings), told)
+    return records
+
+
+def rename_frames(frames: Frames, names: Mapping[str, str]) -> Frames:
+    """Return the frames that are there of ``names``, new names with old ones, and then the others."""
+    old = {frame.replace("/", "_"): files for frame, files in frames.items()}
+    wanted = {name: frame.replace("/", "_") for name, frame in names.items()}
+    new = {name: old[frame] for name, frame in wanted.items() if frame in old}
+    replaced = new.keys() | set(wanted.values())
+    return new | {frame: files for frame, files in old.items() if frame not in replaced}
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """Resizing, cropping and inpainting of scenes after they are read."""
+
+    size: int | None = 512  # length of the shorter side in pixels; None for the original size
+    crop: float | None = 0.5  # place of a square window along the longer side, 0 (top or left) to 1; None for no window
+    enlarge: bool = True  # whether smaller scenes are enlarged
+    fill: tuple[str, ...] = ()  # names of the scenes whose holes are inpainted
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.size is not None and self.size < _MIN_SIZE:
+            raise ValueError(f"size: expected at least {_MIN_SIZE} pixels, or null, got {self.size}")
+        expect_room_for(self.size or _MIN_SIZE)
+        if self.crop is not None and not 0 <= self.crop <= 1:
+            raise ValueError(f"crop: expected a number from 0 to 1, or null, got {self.crop}")
+
+    def __call__(self, scene: Scene) -> Rendering:
+        """Return the scene prepared as it is cached, its photo in 8 bits."""
+        if self.size is not None:
+            scene = fit(scene, self.size, self.crop, enlarge=self.enlarge)
+        depth = inpaint_depth(scene.true_depth) if scene.name in self.fill else scene.true_depth.double()
+        photo = (scene.rgb * 255).round().to(torch.uint8).permute(1, 2, 0)
+        return Rendering(photo.numpy(), depth[0].numpy(), scene.camera)
+
+
+class PreparedDataset(SceneSource):
+    """A data set in its original format; the base class of those in this package.
+
+    Args:
+        found: records of the scenes on disk.
+        scenes: names of the scenes to use; None for those of ``named``, ``found`` for all that are on disk.
+        named: names of the scenes that belong to the data set; None for all that are on disk.
+        count: number of scenes that belong to the data set, if their names are not known.
+
+    """
+
+    evaluation = True
+
+    def __init__(
+        self,
+        name: str,
+        root: str,
+        found: Mapping[str, SceneRecord],
+        scenes: SceneSelection,
+        named: Sequence[str] | None = None,
+        preparation: Preparation | None = None,
+        count: int | None = None,
+    ) -> None:
+        self.name, self._found, self._preparation = name, found, preparation or Preparation(None)
+        folder, named = Path(root).expanduser(), tuple(found if named is None else named)
+        remedy = f"get it with: dsr data get {name}; or say where it is: dataset.root=DIR"
+        if not found:
+            there = "no scene of it" if folder.is_dir() else "no such directory"
+            raise ValueError(f"dataset={name}: expected its files in {folder}, got {there}; {remedy}")
+        if scenes is None:
+            missing, total = [scene for scene in named if scene not in found], count or len(named)
+            if missing or len(named) < total:
+                listed = ", ".join(missing[:_MOST_MISSING]) or "all scenes"
+                rest = f" and {len(missing) - _MOST_MISSING} more" if len(missing) > _MOST_MISSING else ""
+                raise ValueError(
+                    f"dataset={name}: expected {listed}{rest} in {folder}, got {len(named) - len(missing)} of {total} "
+                    f"scenes; {remedy}; or use what is there: dataset.scenes=found"
+                )
+            scenes = named
+        self._scenes = select_scenes(list(found), scenes)
+        unknown = [scene for scene in self._preparation.fill if scene not in (*named, *found)]
+        if unknown:
+            raise ValueError(f"fill: expected names of scenes, got {', '.join(unknown)}")
+
+    def load(self, scene: str) -> Scene:
+        """Return one scene, prepared."""
+        record = self._found[scene]
+        if self._preparation.size is None and scene not in self._preparation.fill:
+            found = record.load()
+        else:
+            kept = load_or_render(self._path(scene), lambda: self._preparation(record.load()))
+            found = kept.scene(self.name, scene)
+        return derived(found, notes=(record.note,) if record.note else ())
+
+    def fingerprint(self, scene: str) -> str:
+        """Return the SHA-256 of the scene's files and of the settings that they are read and prepared with."""
+        plain = asdict(self._preparation) | {"fill": ()}
+        settings = json.dumps([self._found[scene].settings, scene in self._preparation.fill, plain])
+        return hashlib.sha256(f"{settings}{self.content(scene)}".encode()).hexdigest()
+
+    def content(self, scene: str) -> str:
+        """Return the SHA-256 of the scene's files alone; a large file counts by its name, size and time of change."""
+        record = self._found[scene]
+        digest = hashlib.sha256(record.frame.encode())
+        for path in record.files:
+            for file in sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else [path]:
+                if not file.is_file():
+                    raise ValueError(f"{file}: expected a file, there is none")
+                state = file.stat()
+                large = state.st_size > _MAX_HASHED
+                seal = f"{file.name} {state.st_size} {state.st_mtime_ns}" if large else hash_once(file)
+                digest.update(seal.encode())
+        return digest.hexdigest()
+
+    def prepare(self, scenes: Sequence[str], _: Callable[[str], None] = SILENT.say) -> Iterator[str]:
+        """Prepare scenes that are not in the cache, several at a time, and yield the name of each that is ready.
+
+        The name of a scene that fails is yielded, too; loading the scene raises the error.
+        """
+        with ThreadPoolExecutor(min(len(scenes), os.cpu_count() or 1) or 1) as pool:
+            missing = []
+            for scene in scenes if self._preparation.size is not None else ():
+                with contextlib.suppress(OSError, ValueError):  # loading the scene raises it again
+                    if not (cache_directory() / self._path(scene)).is_file():
+                        missing.append(scene)
+            jobs = {pool.submit(self.load, scene): scene for scene in missing}
+            yield from (scene for scene in scenes if scene not in missing)
+            try:
+                for job in as_completed(jobs):
+                    yield jobs[job]
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+
+    def _path(self, scene: str) -> Path:
+        key = hashlib.sha256(f"{self.fingerprint(scene)}{SCENES}".encode()).hexdigest()[:16]
+        return Path("prepared", self.name, f"{scene.replace('/', '_')}-{key}.npz")

@@ -15,7 +15,6 @@ Both binary files are little-endian and start with the number 202021.25 as a flo
 
 from __future__ import annotations
 
-import functools
 import struct
 from pathlib import Path
 from types import MappingProxyType
@@ -25,8 +24,7 @@ import numpy as np
 from torch import Tensor
 
 from dsr.data.frame_files import expect_size, read_picture, to_camera, to_depth
-from dsr.data.preparation import FrameSet, Preparation
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import Preparation, PreparedDataset, SceneSelection, make_records
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.utils.guards import MOST_FILE, natural_key, read_limited
@@ -59,9 +57,7 @@ def find_frames(root: Path, rendering: Literal["clean", "final"] = "final") -> d
 
 def read_depth(path: Path, farthest: float = FARTHEST) -> Tensor:
     """Return a ``.dpt`` file, (1, H, W) float64 in metres, NaN where it is beyond ``farthest`` metres."""
-    content = read_limited(path, MOST_FILE)
-    if len(content) < _DPT_HEADER.size or not content.startswith(_TAG):
-        raise ValueError(f"{path}: expected a .dpt file (tag 202021.25), got {_opening(content)}")
+    content = _tagged(path, _DPT_HEADER.size)
     _, width, height = _DPT_HEADER.unpack_from(content)
     length = len(content) - _DPT_HEADER.size
     if width < 1 or height < 1 or length != 4 * width * height:
@@ -72,10 +68,19 @@ def read_depth(path: Path, farthest: float = FARTHEST) -> Tensor:
 
 def read_camera(path: Path, size: tuple[int, int]) -> Camera:
     """Return the intrinsics of a ``.cam`` file for pictures of ``size`` = (height, width)."""
-    content = read_limited(path, MOST_FILE)
-    if len(content) != _CAM_LENGTH or not content.startswith(_TAG):
-        raise ValueError(f"{path}: expected a .cam file (tag 202021.25, {_CAM_LENGTH} bytes), got {_opening(content)}")
+    content = _tagged(path, _CAM_LENGTH)
+    if len(content) > _CAM_LENGTH:
+        raise ValueError(f"{path}: expected {_CAM_LENGTH} bytes, got {len(content)}")
     return to_camera(path, np.frombuffer(content, "<f8", count=9, offset=4).reshape(3, 3), size)
+
+
+def _tagged(path: Path, least: int) -> bytes:
+    """Return the content of a file that begins with the tag and has at least so many bytes."""
+    content = read_limited(path, MOST_FILE)
+    if len(content) < least or not content.startswith(_TAG):
+        came = f"{len(content)} bytes that start with {content[:4]!r}"
+        raise ValueError(f"{path}: expected a {path.suffix} file (tag 202021.25, {least} bytes or more), got {came}")
+    return content
 
 
 def load_frame(
@@ -88,27 +93,16 @@ def load_frame(
     return Scene(dataset, name, rgb, read_camera(camera_path, size), depth)
 
 
-def _opening(content: bytes) -> str:
-    """Return a description of a file of another kind."""
-    return f"{len(content)} bytes that start with {content[:4]!r}"
-
-
-_SEQUENCES_WITH_THREE = 12  # number of sequences of which three frames are used, not two: 2 x 23 + 12 = 58
-
-
-def sintel_frames() -> tuple[str, ...]:
-    """Return the 58 frames: those at a third and two thirds of each sequence, and the first of twelve sequences."""
-    frames = []
-    for index, (sequence, length) in enumerate(SEQUENCES.items()):
-        numbers = [1] if index < _SEQUENCES_WITH_THREE else []
-        frames += [f"{sequence}_frame_{number:04d}" for number in (*numbers, length // 3, 2 * length // 3)]
-    return tuple(frames)
-
-
+# The 58 frames to train on: those at a third and two thirds of each sequence, and the first of twelve sequences
+FRAMES = tuple(
+    f"{sequence}_frame_{number:04d}"
+    for index, (sequence, length) in enumerate(SEQUENCES.items())
+    for number in ((1, length // 3, 2 * length // 3) if index < 12 else (length // 3, 2 * length // 3))
+)
 DETECTED = ((find_frames, load_frame, "sintel"),)
 
 
-class Sintel(FrameSet):
+class Sintel(PreparedDataset):
     """Frames of MPI Sintel (Butler et al., ECCV 2012); ``final`` renderings have blur, fog and the like."""
 
     evaluation = False
@@ -121,6 +115,6 @@ class Sintel(FrameSet):
         rendering: Literal["clean", "final"] = "clean",
         farthest: float = FARTHEST,
     ) -> None:
-        find = functools.partial(find_frames, rendering=rendering)
+        found = make_records(find_frames(Path(root).expanduser(), rendering), load_frame, "sintel", farthest=farthest)
         preparation = Preparation(size, crop=None, enlarge=False)
-        super().__init__("sintel", root, find, load_frame, scenes, sintel_frames(), preparation, farthest=farthest)
+        super().__init__("sintel", root, found, scenes, FRAMES, preparation)

@@ -1,7 +1,5 @@
 """``dataset=stereo_board``: a stereo camera before a board, which is an exact plane.
 
-``downsampling=measured scale=1`` takes the camera's maps as the input.
-
 Five pairs of a RealSense that came with the code of Kienle and Petri, "Multi-Object Self-Supervised Depth Denoising",
 arXiv 2305.05778, MIT licence; ``resources/images/uncalibrated/realsense`` in the commit c73b356 of
 github.com/alr-internship/self-supervised-depth-denoising:
@@ -17,7 +15,6 @@ camera has no lens, so that planes are bent in it by up to 4.5 mm, the truth's a
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -26,10 +23,9 @@ import cv2
 import numpy as np
 import torch
 
-from dsr.data.download.collections import CATALOGUE
+from dsr.data.download import CATALOGUE
 from dsr.data.frame_files import find_beside, in_natural_order, read_frame
-from dsr.data.preparation import FrameSet
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import PreparedDataset, SceneSelection, make_records
 from dsr.geometry.camera import Camera, Lens
 from dsr.sample import Scene
 from dsr.utils.versions import file_hash
@@ -69,13 +65,12 @@ BOARDS = MappingProxyType(
 )
 # Pixels inside the outline up to which its own error of a pixel or two counts, and up to which the border reaches
 INSIDE, BORDER = 12, 36
-_PHOTO = re.compile(r"(\d+)\.(?:png|jpg)")
 
 
 def find_frames(root: Path) -> dict[str, tuple[Path, Path, str]]:
     """Return photo, depth and name by name "8", in order."""
     found = {}
-    for _, name, (photo, depth) in find_beside(root, "color", _PHOTO, ("depth/{}.png",)):
+    for _, name, (photo, depth) in find_beside(root, "color", r"(\d+)\.(?:png|jpg)", ("depth/{}.png",)):
         if name in BOARDS:
             found[name] = (photo, depth, name)
     return in_natural_order(found)
@@ -88,29 +83,20 @@ def load_frame(rgb_path: Path, depth_path: Path, board: str, dataset: str, name:
     :data:`BORDER`, which shows what is blurred across the outline.
     """
     rgb, measured = read_frame(rgb_path, depth_path, size=(CAMERA.height, CAMERA.width))
-    inside = depth_inside(BOARDS[board])
+    filled = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+    cv2.fillPoly(filled, [np.round(BOARDS[board].outline).astype(np.int32)], 1)
+    inside = cv2.distanceTransform(filled, cv2.DIST_L2, 5)  # pixels inside the outline, 0 outside
     regions = {"board": inside > INSIDE, "border": (inside > INSIDE) & (inside <= BORDER)}
-    truth = torch.from_numpy(plane_depth(BOARDS[board]))[None]
     found = {each: torch.from_numpy(region.astype(np.uint8))[None] for each, region in regions.items()}
-    return Scene(dataset, name, rgb, CAMERA, truth, {1: measured}, regions=found)
-
-
-def depth_inside(board: Board) -> np.ndarray:
-    """Return how many pixels inside the board's outline each pixel lies, (1080, 1920) float32, 0 outside."""
-    inside = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
-    cv2.fillPoly(inside, [np.round(board.outline).astype(np.int32)], 1)
-    return cv2.distanceTransform(inside, cv2.DIST_L2, 5)
-
-
-def plane_depth(board: Board) -> np.ndarray:
-    """Return the board's depth, (1080, 1920) float64 in metres, NaN outside of its outline."""
-    depth = np.full((CAMERA.height, CAMERA.width), np.nan)
-    rows, columns = np.nonzero(depth_inside(board))
+    # each pixel's ray, bent by the lens, meets the plane
+    truth = np.full(inside.shape, np.nan)
+    rows, columns = np.nonzero(inside)
     matrix = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])
     pixels = np.stack([columns, rows], axis=1).astype(np.float64)[:, None]
     across, down = cv2.undistortPoints(pixels, matrix, np.array(LENS.coefficients))[:, 0].T
-    depth[rows, columns] = board.distance / (np.stack([across, down, np.ones_like(down)], axis=1) @ board.normal)
-    return depth
+    rays = np.stack([across, down, np.ones_like(down)], axis=1)
+    truth[rows, columns] = BOARDS[board].distance / (rays @ BOARDS[board].normal)
+    return Scene(dataset, name, rgb, CAMERA, torch.from_numpy(truth)[None], {1: measured}, regions=found)
 
 
 def _find_pinned(root: Path) -> dict[str, tuple[Path, Path, str]]:
@@ -122,10 +108,11 @@ def _find_pinned(root: Path) -> dict[str, tuple[Path, Path, str]]:
 DETECTED = ((_find_pinned, load_frame, "stereo_board"),)
 
 
-class StereoBoard(FrameSet):
+class StereoBoard(PreparedDataset):
     """Five frames of a stereo camera before an exact plane, at their own size, its map as measured at x1."""
 
     regions = ("board", "border")
 
     def __init__(self, root: str, scenes: SceneSelection = None) -> None:
-        super().__init__("stereo_board", root, find_frames, load_frame, scenes, tuple(BOARDS))
+        found = make_records(find_frames(Path(root).expanduser()), load_frame, "stereo_board")
+        super().__init__("stereo_board", root, found, scenes, tuple(BOARDS))

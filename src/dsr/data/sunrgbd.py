@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 from torch import Tensor
 
@@ -33,9 +32,7 @@ from dsr.data.frame_files import (
     to_depth,
     walk,
 )
-from dsr.data.preparation import Frames, FrameSet, Preparation, rename_frames
-from dsr.data.scene_source import SceneSelection
-from dsr.geometry.camera import Camera
+from dsr.data.scene_source import Preparation, PreparedDataset, SceneSelection, make_records, rename_frames
 from dsr.io.depth_files import turn_back_bits
 from dsr.io.images import read_numbers
 from dsr.io.reading import SUNRGBD_BITS
@@ -60,17 +57,13 @@ def read_depth(path: Path) -> Tensor:
     return to_depth(path, turn_back_bits(str(path), read_16bit(path), SUNRGBD_BITS) / 1000)
 
 
-def read_intrinsics(path: Path, size: tuple[int, int]) -> Camera:
-    """Return the camera that an ``intrinsics.txt`` gives pictures of ``size`` = (height, width)."""
-    return to_camera(path, read_numbers(path, 9).reshape(3, 3), size)
-
-
 def load_frame(
     folder: Path, dataset: str, name: str, *, refined: bool = False, intrinsics: Intrinsics | None = None
 ) -> Scene:
     """Return the scene of a folder; ``intrinsics`` are for one without ``intrinsics.txt``."""
-    rgb_path, depth_path, *matrix = frame_files(folder, refined=refined)
-    given = matrix[0] if matrix else intrinsics
+    rgb_path, depth_path = _only(folder / "image"), _only(folder / ("depth_bfx" if refined else "depth"))
+    matrix = folder / "intrinsics.txt"
+    given = matrix if matrix.is_file() else intrinsics
     if given is None:
         raise ValueError(f"{folder}: expected intrinsics.txt, or intrinsics=(fx, fy, cx, cy) instead, got neither")
     return load_pair(rgb_path, depth_path, dataset, name, given)
@@ -82,15 +75,10 @@ def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str, intrins
     size = (rgb.shape[1], rgb.shape[2])
     expect_size(depth_path, depth, size)
     if isinstance(intrinsics, Path):
-        return Scene(dataset, name, rgb, read_intrinsics(intrinsics, size), depth)
-    return Scene(dataset, name, rgb, given_camera(intrinsics, size), depth)
-
-
-def frame_files(folder: Path, *, refined: bool = False) -> tuple[Path, ...]:
-    """Return the files of a scene folder that are read: colour, depth, and intrinsics.txt where there is one."""
-    matrix = folder / "intrinsics.txt"
-    depth = "depth_bfx" if refined else "depth"
-    return (_only(folder / "image"), _only(folder / depth), *([matrix] if matrix.is_file() else []))
+        camera = to_camera(intrinsics, read_numbers(intrinsics, 9).reshape(3, 3), size)
+    else:
+        camera = given_camera(intrinsics, size)
+    return Scene(dataset, name, rgb, camera, depth)
 
 
 def _only(folder: Path) -> Path:
@@ -118,12 +106,10 @@ FRAMES = MappingProxyType(
         "xtion_3": "xtion/sun3ddata/brown_bm_2/brown_bm_2",
     }
 )
-
-
 DETECTED = ((find_frames, load_frame, "sunrgbd"),)
 
 
-class SunRGBD(FrameSet):
+class SunRGBD(PreparedDataset):
     """Scenes of SUN RGB-D; the true depth is what the sensor measured, with its holes, or the authors' refined one."""
 
     def __init__(
@@ -139,15 +125,13 @@ class SunRGBD(FrameSet):
         if intrinsics is not None and len(intrinsics) != 4:
             raise ValueError(f"intrinsics: expected fx, fy, cx, cy, got {len(intrinsics)} numbers")
 
-        def find(folder: Path) -> Frames:
-            found = find_frames(folder)
-            return rename_frames(found, {name: _first_below(found, path) for name, path in frames.items()})
-
-        settings: dict[str, Any] = {"refined": refined, "intrinsics": intrinsics and tuple(intrinsics)}
-        super().__init__("sunrgbd", root, find, load_frame, scenes, tuple(FRAMES), Preparation(size, crop), **settings)
-
-
-def _first_below(found: Frames, path: str) -> str:
-    """Return the first scene whose name is or begins with a path, below ``SUNRGBD`` or not; the path where none is."""
-    beginnings = tuple(f"{above}{path}/".replace("/", "_") for above in ("", "SUNRGBD/"))
-    return next((name for name in found if f"{name}_".replace("/", "_").startswith(beginnings)), path)
+        all_frames = find_frames(Path(root).expanduser())
+        places = {}
+        for name, path in frames.items():  # the first scene below a path, which may be below SUNRGBD
+            beginnings = tuple(f"{above}{path}/".replace("/", "_") for above in ("", "SUNRGBD/"))
+            below = (each for each in all_frames if f"{each}_".replace("/", "_").startswith(beginnings))
+            places[name] = next(below, path)
+        given = intrinsics and tuple(intrinsics)
+        renamed = rename_frames(all_frames, places)
+        found = make_records(renamed, load_frame, "sunrgbd", refined=refined, intrinsics=given)
+        super().__init__("sunrgbd", root, found, scenes, tuple(FRAMES), Preparation(size, crop))

@@ -16,9 +16,8 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from dsr.data.frame_files import expect_size, name_of, read_picture, to_depth, walk
-from dsr.data.preparation import FrameSet, Preparation
-from dsr.data.scene_source import SceneSelection
+from dsr.data.frame_files import name_of, read_picture, to_depth, walk
+from dsr.data.scene_source import Preparation, PreparedDataset, SceneSelection, make_records
 from dsr.geometry.camera import Camera
 from dsr.io.images import read_values
 from dsr.sample import Scene
@@ -55,15 +54,13 @@ def read_depth(path: Path, farthest: float = FARTHEST) -> Tensor:
 
 def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str, *, farthest: float = FARTHEST) -> Scene:
     """Return one frame at 640 x 480; depths beyond ``farthest`` metres are holes."""
-    rgb = read_picture(rgb_path)
-    expect_size(rgb_path, rgb, _SIZE)
-    return Scene(dataset, name, rgb, CAMERA, read_depth(depth_path, farthest))
+    return Scene(dataset, name, read_picture(rgb_path, _SIZE), CAMERA, read_depth(depth_path, farthest))
 
 
 DETECTED = ((find_frames, load_frame, "tartanair"),)
 
 
-class TartanAir(FrameSet):
+class TartanAir(PreparedDataset):
     """Frames of TartanAir: rendered outdoor and indoor scenes (Wang et al., IROS 2020)."""
 
     def __init__(
@@ -74,5 +71,5 @@ class TartanAir(FrameSet):
         crop: float = 0.5,
         farthest: float = FARTHEST,
     ) -> None:
-        preparation = Preparation(size, crop)
-        super().__init__("tartanair", root, find_frames, load_frame, scenes, preparation=preparation, farthest=farthest)
+        found = make_records(find_frames(Path(root).expanduser()), load_frame, "tartanair", farthest=farthest)
+        super().__init__("tartanair", root, found, scenes, preparation=Preparation(size, crop))

@@ -1,6 +1,6 @@
 """``dataset=tofmark``: samples of a time-of-flight sensor and a photo (Ferstl et al., ICCV 2013).
 
-Voynov et al. 2019 use Books, Devil and Shark with the maps of the real sensor as the input: ``downsampling=measured``.
+Voynov et al. 2019 use Books, Devil and Shark with the maps of the real sensor as the input.
 
     benchmarking_dataset_NAME.mat     intensity, true depth, and the sensor's samples projected into the intensity image
     NAME.bmp, NAME_depth.bmp          intensity and samples in 8 bits; 0 = no sample, which 97.5 % of the pixels are
@@ -17,7 +17,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -25,8 +24,7 @@ from torch import Tensor
 
 from dsr.data.frame_files import expect_size, given_camera, in_natural_order, name_of, read_picture, to_depth, walk
 from dsr.data.matlab import read_variables
-from dsr.data.preparation import FrameSet
-from dsr.data.scene_source import SceneSelection
+from dsr.data.scene_source import PreparedDataset, SceneSelection, make_records
 from dsr.io.images import read_levels
 from dsr.sample import Scene
 
@@ -40,11 +38,8 @@ _ROLES: Mapping[str, tuple[str, ...]] = {
     "depth": ("truth|gt", "hr|highres", "depth"),
     "samples": ("tof", "sparse|projected", "lr|mr|lowres", "depth"),
 }
-_OTHERS = {
-    "intensity": re.compile("weight|mask|conf|amplitude|depth|tof|disp"),
-    "depth": re.compile("weight|mask|conf|amplitude"),
-    "samples": re.compile("weight|mask|conf|amplitude"),
-}
+_OTHER = "weight|mask|conf|amplitude"  # in the names of variables that are none of these
+_NO_INTENSITY = f"{_OTHER}|depth|tof|disp"
 
 
 def find_frames(root: Path) -> dict[str, tuple[Path, Path | None]]:
@@ -69,7 +64,6 @@ def load_frame(
     intrinsics: tuple[float, float, float, float] | None = None,
     depth_range: tuple[float, float] | None = None,
     variables: Mapping[str, str] | None = None,
-    factors: Sequence[int] = FACTORS,
 ) -> Scene:
     """Return one scene, with the samples as measured low-resolution maps.
 
@@ -85,12 +79,19 @@ def load_frame(
         rgb, depth, samples = read_matrices(path, variables)
     else:
         rgb = read_picture(path)
-        samples = _metres(samples_path, *read_samples(samples_path), depth_range)
+        levels, known = read_samples(samples_path)
+        if depth_range is None:
+            ends = "depth_range=(metres of 1, metres of 255)"
+            raise ValueError(f"{samples_path}: expected {ends}, as 8 bits have lost the metric scale")
+        near, far = depth_range
+        if not 0 < near < far < np.inf:
+            raise ValueError(f"depth_range: expected 0 < metres of 1 < metres of 255, got {near:g} and {far:g}")
+        samples = torch.where(known, near + (levels * 255 - 1) / 254 * (far - near), torch.nan)
         expect_size(samples_path, samples, tuple(rgb.shape[1:]))
     camera = given_camera(intrinsics, (rgb.shape[1], rgb.shape[2]))
     measured: dict[float, Tensor] = {}
     if samples is not None:
-        measured = {factor: block_means(samples, factor) for factor in factors}
+        measured = {factor: block_means(samples, factor) for factor in FACTORS}
     return Scene(dataset, name, rgb, camera, depth, measured)
 
 
@@ -126,34 +127,24 @@ def read_matrices(
 
 def block_means(depth: Tensor, factor: int) -> Tensor:
     """Return the mean of 1/z in each ``factor`` x ``factor`` block of a depth map (1, H, W), as depth."""
-    if not 1 <= factor <= min(depth.shape[1:]):
-        raise ValueError(f"factors: expected from 1 to {min(depth.shape[1:])}, got {factor}")
     height, width = depth.shape[1] // factor, depth.shape[2] // factor
     inverse = depth[:, : height * factor, : width * factor].reciprocal().reshape(1, height, factor, width, factor)
     return inverse.nanmean(dim=(2, 4)).reciprocal()
-
-
-def _metres(path: Path, values: Tensor, known: Tensor, depth_range: tuple[float, float] | None) -> Tensor:
-    """Return the depth of levels over 255, NaN where there is no sample."""
-    if depth_range is None:
-        raise ValueError(
-            f"{path}: expected depth_range=(metres of 1, metres of 255), as 8 bits have lost the metric scale"
-        )
-    near, far = depth_range
-    if not 0 < near < far < np.inf:
-        raise ValueError(f"depth_range: expected 0 < metres of 1 < metres of 255, got {near:g} and {far:g}")
-    return torch.where(known, near + (values * 255 - 1) / 254 * (far - near), torch.nan)
 
 
 def _fitting_variable(path: Path, role: str, found: Mapping[str, np.ndarray], chosen: Mapping[str, str]) -> str | None:
     """Return the variable that fits a role by its size and best by its name; None where none fits."""
     size = found[chosen["intensity"]].shape[:2] if "intensity" in chosen else None
     names = {name: re.sub(r"[^a-z0-9]", "", name.rpartition(".")[2].lower()) for name in found}
-    fitting = [
-        name
-        for name, array in found.items()
-        if name not in chosen.values() and not _OTHERS[role].search(names[name]) and _fits(role, array, size)
-    ]
+    fitting = []
+    for name, array in found.items():
+        if role == "intensity":
+            fits = min(array.shape[:2]) >= _SMALLEST and (array.ndim == 2 or array.shape[2:] == (3,))
+        else:
+            fits = array.shape == size and ((array > 0).mean() < _SPARSE) == (role == "samples")
+        other = re.search(_NO_INTENSITY if role == "intensity" else _OTHER, names[name])
+        if fits and not other and name not in chosen.values():
+            fitting.append(name)
     fitting.sort(key=lambda name: -found[name].size)
     for words in _ROLES[role]:
         for name in fitting:
@@ -162,13 +153,6 @@ def _fitting_variable(path: Path, role: str, found: Mapping[str, np.ndarray], ch
     if len(fitting) > 1 and role != "intensity":
         raise ValueError(f"{path}: expected one variable for {role}, it may be any of {', '.join(fitting)}")
     return fitting[0] if fitting and role != "intensity" else None
-
-
-def _fits(role: str, array: np.ndarray, size: tuple[int, ...] | None) -> bool:
-    """Return whether an array may be what a role asks for beside an intensity image of a size."""
-    if role == "intensity":
-        return min(array.shape[:2]) >= _SMALLEST and (array.ndim == 2 or array.shape[2:] == (3,))
-    return array.shape == size and ((array > 0).mean() < _SPARSE) == (role == "samples")
 
 
 def _picture(path: Path, name: str, array: np.ndarray) -> Tensor:
@@ -203,12 +187,10 @@ def _listed(found: Mapping[str, np.ndarray]) -> str:
 
 SCENES = ("books", "devil", "shark")
 ESTIMATED = (549.2, 549.2, 375.2, 334.3)  # fx, fy, cx, cy in pixels of the 610 x 810 photos
-
-
 DETECTED = ((find_frames, load_frame, "tofmark"),)
 
 
-class ToFMark(FrameSet):
+class ToFMark(PreparedDataset):
     """Scenes of ToFMark at their original size, with the samples as measured maps at x4 and x8."""
 
     def __init__(
@@ -222,11 +204,13 @@ class ToFMark(FrameSet):
         for name, values, count in (("intrinsics", intrinsics, 4), ("depth_range", depth_range, 2)):
             if values is not None and len(values) != count:
                 raise ValueError(f"{name}: expected {count} numbers, got {len(values)}")
-        if intrinsics is None:
-            self.note = "the benchmark has no camera: it is an estimate"
-        settings: dict[str, Any] = {
-            "intrinsics": tuple(intrinsics or ESTIMATED),
-            "depth_range": depth_range and tuple(depth_range),
-            "variables": variables and dict(variables),
-        }
-        super().__init__("tofmark", root, find_frames, load_frame, scenes, SCENES, **settings)
+        found = make_records(
+            find_frames(Path(root).expanduser()),
+            load_frame,
+            "tofmark",
+            "the benchmark has no camera: it is an estimate" if intrinsics is None else "",
+            intrinsics=tuple(intrinsics or ESTIMATED),
+            depth_range=depth_range and tuple(depth_range),
+            variables=variables and dict(variables),
+        )
+        super().__init__("tofmark", root, found, scenes, SCENES)

@@ -17,11 +17,11 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from rich.text import Text
 
-from dsr.data.download.collections import CATALOGUE
+from dsr.data.download import CATALOGUE
 from dsr.doctor.about import graphics_cards, processor, version_lines
 from dsr.doctor.findings import FINE, Finding, Level, show_findings
 from dsr.methods import weights
-from dsr.synthetic.rendering import cache_directory
+from dsr.synthetic import cache_directory
 from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.console import USAGE_ERROR, one_line, open_console
 from dsr.utils.files import data_root

@@ -16,9 +16,9 @@ from functools import lru_cache
 import numpy as np
 
 from dsr.geometry.camera import VIRTUAL_BASELINE, Camera
+from dsr.synthetic import Rendering
 from dsr.synthetic import raycast as rc
 from dsr.synthetic.raycast import Array, Body, Field, mix, noise, rotation
-from dsr.synthetic.rendering import Rendering
 
 Vector = tuple[float, float, float]
 

@@ -88,7 +88,7 @@ def hash_once(path: Path) -> str:
     return _hash(path, state.st_size, state.st_mtime_ns)
 
 
-@functools.lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=4096)
 def _hash(path: Path, _size: int, _changed: int) -> str:
     return file_hash(path)
 

@@ -32,7 +32,7 @@ from requests.adapters import HTTPAdapter
 from urllib3 import Retry
 from urllib3.exceptions import HTTPError
 
-from dsr.data.download.collections import Collection, Item
+from dsr.data.download import Collection, Item
 from dsr.utils.console import one_line
 from dsr.utils.files import (
     FullDiskError,
@@ -93,7 +93,7 @@ class Checksums(dict[str, Entry]):
     def __init__(self, root: Path) -> None:
         super().__init__()
         self.root, self.path = root, root / "checksums.json"
-        self._found: dict[str, Entry] = {}
+        self.found: dict[str, Entry] = {}  # of what exists without a record, for :meth:`record_found`
         try:
             entries = parse_json(read_limited(self.path)) if self.path.is_file() else {}
             self.update({name: _entry(name, fields) for name, fields in entries.items()})
@@ -109,13 +109,9 @@ class Checksums(dict[str, Entry]):
         plain = {name: {k: v for k, v in asdict(each).items() if v is not None} for name, each in sorted(self.items())}
         write_text(self.path, json.dumps(plain, indent=1) + "\n")
 
-    def add_found(self, name: str, entry: Entry) -> None:
-        """Take the entry of what exists without a record, to be written by :meth:`record_found`."""
-        self._found[name] = entry
-
     def record_found(self, progress: Progress) -> None:
         """Record what was found, and report it; the directory may be one to read from only."""
-        found, self._found = self._found, {}
+        found, self.found = self.found, {}
         names = list(found)
         few = ", ".join(names) if len(names) < 4 else f"{names[0]}, {names[1]} and {len(names) - 2} more"
         try:
@@ -421,7 +417,15 @@ def verify(collection: Collection, root: Path, progress: Progress) -> list[str]:
     """
     with lock_directory(root):
         checksums = Checksums(root)
-        problems = [_problem(item, checksums, progress) for item in collection.items]
+        problems: list[str | None] = []
+        for item in collection.items:
+            if item.unpack_to is not None and item.path not in checksums and (entry := _adopted(item, root)):
+                checksums.found[item.path] = entry
+                continue
+            problem = _lack(item, checksums)
+            if problem is None and item.unpack_to is None:
+                problem = _difference(item.path, checksums, progress, item.sha256)
+            problems.append(problem)
         if not collection.items:
             paths = {path for pattern in collection.patterns for path in _matches(collection, root, pattern)}
             names = sorted((path.relative_to(root).as_posix() for path in paths), key=natural_key)
@@ -429,17 +433,6 @@ def verify(collection: Collection, root: Path, progress: Progress) -> list[str]:
             problems += [_difference(name, checksums, progress) for name in names]
         checksums.record_found(progress)
     return [problem for problem in problems if problem is not None]
-
-
-def _problem(item: Item, checksums: Checksums, progress: Progress) -> str | None:
-    """Return what is wrong with an item; one without an entry is found."""
-    if item.unpack_to is not None and item.path not in checksums and (entry := _adopted(item, checksums.root)):
-        checksums.add_found(item.path, entry)
-        return None
-    problem = _lack(item, checksums)
-    if problem is None and item.unpack_to is None:
-        problem = _difference(item.path, checksums, progress, item.sha256)
-    return problem
 
 
 def _difference(name: str, checksums: Checksums, progress: Progress, pinned: str | None = None) -> str | None:
@@ -450,7 +443,7 @@ def _difference(name: str, checksums: Checksums, progress: Progress, pinned: str
     except (ValueError, OSError) as error:
         return str(error)
     if name not in checksums:
-        checksums.add_found(name, Entry(digest, path.stat().st_size))
+        checksums.found[name] = Entry(digest, path.stat().st_size)
     return None
 
 
@@ -461,26 +454,22 @@ def _checked_hash(
 
     ``source`` is what the message calls the file.
     """
-    _expect_kind(path, Path(name).suffix, source)
-    with progress.task(name, unit="bytes") as moved:
-        digest = file_hash(path, moved)
-    expected = pinned or (checksums[name].sha256 if name in checksums else None)
-    if expected not in (None, digest):
-        known, cure = "which dsr knows", ""
-        if pinned is None:
-            known, cure = f"as recorded in {checksums.path}", "; if the new one is right, delete the entry there"
-        raise ValueError(f"{source}: expected sha256 {expected}, {known}, got {digest}{cure}")
-    return digest
-
-
-def _expect_kind(path: Path, suffix: str, source: str) -> None:
-    """Check that a file begins as one with this suffix does; ``source`` is what the message calls it."""
     with opened(path) as file:
         beginning = file.read(512)
+    suffix = Path(name).suffix
     expected, skipped = _BEGINNINGS.get(suffix.lower()), _COUNTED.get(suffix.lower(), 0)
     plain = bool(beginning) and b"\0" not in beginning and not beginning.lstrip().startswith(b"<")  # no web page
     if not (beginning.startswith(expected, skipped) if expected else plain):
         raise ValueError(f"{source}: expected a {suffix} file, got one that begins with {beginning[:8]!r}")
+    with progress.task(name, unit="bytes") as moved:
+        digest = file_hash(path, moved)
+    known = pinned or (checksums[name].sha256 if name in checksums else None)
+    if known not in (None, digest):
+        origin, cure = "which dsr knows", ""
+        if pinned is None:
+            origin, cure = f"as recorded in {checksums.path}", "; if the new one is right, delete the entry there"
+        raise ValueError(f"{source}: expected sha256 {known}, {origin}, got {digest}{cure}")
+    return digest
 
 
 def _adopted(item: Item, root: Path) -> Entry | None:

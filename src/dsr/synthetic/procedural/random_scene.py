@@ -14,15 +14,13 @@ from typing import NamedTuple
 import numpy as np
 
 from dsr.geometry.camera import Camera
-from dsr.synthetic.procedural.furniture import arched_wall, blinds, column, shelf, table
+from dsr.synthetic import Rendering
+from dsr.synthetic.procedural import furniture, reliefs
 from dsr.synthetic.procedural.materials import Body, SceneBuilder
-from dsr.synthetic.procedural.organic import branches, creature, figure, pebble, plant
 from dsr.synthetic.procedural.photo import Lighting, Tracer, Viewpoint, aim_camera, develop, radiance, random_lighting
-from dsr.synthetic.procedural.props import backdrop, fill_room, random_object, scatter, shell, tableware
-from dsr.synthetic.procedural.reliefs import RELIEFS, blanket, crumple, curtain, folds, ground, relief
+from dsr.synthetic.procedural.reliefs import blanket, branches, creature, curtain, figure, pebble, plant
 from dsr.synthetic.procedural.shape import box, frustum, merge, place_on_ground, prism, random_rotation, random_solid
 from dsr.synthetic.raycast import rotation_about
-from dsr.synthetic.rendering import Rendering
 
 PROCEDURAL_VERSION = 1  # version of the scenes; it has to be increased whenever an image changes
 _PREVIEW_SIZE = 64
@@ -41,8 +39,8 @@ class SceneLayout(NamedTuple):
 def room(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
     """Return a furnished room, seen towards a corner or a wall."""
     size = rng.uniform([2.6, 2.8, 2.2], [5.5, 6.0, 3.2])
-    shell(rng, scene, size)
-    fill_room(rng, scene, size)
+    furniture.shell(rng, scene, size)
+    furniture.fill_room(rng, scene, size)
 
     def views(draw: np.random.Generator) -> Viewpoint:
         eye = draw.uniform([-0.42, -0.47, 0], [0.42, -0.2, 0]) * size
@@ -58,15 +56,15 @@ def room(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
 def tabletop(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
     """Return many small objects on a table in front of a backdrop."""
     wide, deep = rng.uniform([0.7, 0.5], [1.6, 0.9])
-    tableware(rng, scene, wide, deep)
+    furniture.tableware(rng, scene, wide, deep)
     if rng.random() < 0.35:
-        sheet = relief(rng, (folds, crumple, ground)[rng.integers(3)], 1.0)
+        sheet = reliefs.relief(rng, (reliefs.folds, reliefs.crumple, reliefs.ground)[rng.integers(3)], 1.0)
         scene.add(sheet.scale([wide, deep, 0.35]).translate(0, 0, -0.002), "cloth", 0.5)
     high = rng.uniform(0.45, 0.8)
-    legs = table(rng, (wide, deep), high)[1].translate(0, 0, -high - 0.03)
+    legs = furniture.table(rng, (wide, deep), high)[1].translate(0, 0, -high - 0.03)
     scene.add(box([wide, deep, 0.04]).translate(0, 0, -0.041), "wood", 0.6)
     scene.add(legs, "wood", 0.3)
-    backdrop(rng, scene, deep / 2 + rng.uniform(0.02, 1.5), -high - 0.03)
+    furniture.backdrop(rng, scene, deep / 2 + rng.uniform(0.02, 1.5), -high - 0.03)
 
     def views(draw: np.random.Generator) -> Viewpoint:
         rise, yaw, far = np.deg2rad(draw.uniform(12, 65)), draw.uniform(-0.6, 0.6), draw.uniform(0.55, 1.2)
@@ -87,7 +85,7 @@ def statue(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
         scene.add(shape.translate((k - (count - 1) / 2) * 0.7, rng.uniform(-0.1, 0.1), 0), "stone", 0.6)
     base = box([1.2, 0.8, 0.3]) if rng.random() < 0.5 else frustum(0.7, 0.6, 0.3)
     scene.add(base.translate(0, 0, -0.3), "stone", 0.6)
-    backdrop(rng, scene, rng.uniform(0.5, 2.0), -0.29)
+    furniture.backdrop(rng, scene, rng.uniform(0.5, 2.0), -0.29)
     aim, middle = rng.uniform(0.35, 0.8), 0.35 * (count - 1)
 
     def views(draw: np.random.Generator) -> Viewpoint:
@@ -102,7 +100,7 @@ def statue(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
 def relief_wall(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
     """Return a flat or curved relief that fills the picture, sometimes with objects in front of it."""
     bend = rng.choice([0.0, 0.0, 0.12, -0.12, 0.3])
-    sheet = relief(rng, RELIEFS[rng.integers(len(RELIEFS))], 3.0, 340, bend)
+    sheet = reliefs.relief(rng, reliefs.RELIEFS[rng.integers(len(reliefs.RELIEFS))], 3.0, 340, bend)
     family = str(rng.choice(["stone", "brick", "wall", "cloth", "earth"]))
     scene.add(sheet.turn(0, 90), family, 0.8)
     scene.add(box([9, 0.1, 9]).translate(0, 0.35, -4.5), "wall", 1.0)
@@ -122,10 +120,10 @@ def relief_wall(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
 
 def landscape(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
     """Return ground or rumpled cloth seen at a slant, with stones, plants or objects on it and a backdrop."""
-    maker = (ground, ground, crumple, folds)[rng.integers(4)]
-    sheet = relief(rng, maker, 4.0, 340).scale([1, 1, 1.0 if maker is ground else 1.3])
+    maker = (reliefs.ground, reliefs.ground, reliefs.crumple, reliefs.folds)[rng.integers(4)]
+    sheet = reliefs.relief(rng, maker, 4.0, 340).scale([1, 1, 1.0 if maker is reliefs.ground else 1.3])
     floor = sheet.translate(0, 1.4, -np.quantile(sheet.vertices[:, 2], 0.5))
-    cloth = maker in (crumple, folds)
+    cloth = maker in (reliefs.crumple, reliefs.folds)
     scene.add(floor, "cloth" if cloth else "earth", 0.9)
     for _ in range(rng.integers(0, 14)):
         spot = rng.uniform([-1.1, 0.2], [1.1, 2.8])
@@ -138,7 +136,7 @@ def landscape(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
     if rng.random() < 0.5:
         greens = plant(rng) if rng.random() < 0.5 else [branches(rng)]
         scene.add_all([part.translate(*root) for part in greens], ["plant"], 0.3)
-    backdrop(rng, scene, 3.1, -0.4)
+    furniture.backdrop(rng, scene, 3.1, -0.4)
 
     def views(draw: np.random.Generator) -> Viewpoint:
         rise = draw.uniform(0.5, 2.0)
@@ -152,7 +150,7 @@ def portico(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
     """Return a portico with columns, steps, arches, railings and blocks, several metres away."""
     stone, count = scene.paint("stone", 1.5), int(rng.integers(2, 6))
     pitch, high = rng.uniform(1.2, 2.4), rng.uniform(2.6, 4.0)
-    shaft = column(rng, high)
+    shaft = furniture.column(rng, high)
     spots = (np.arange(count) - (count - 1) / 2) * pitch
     span = pitch * (count + 1)
     shapes = [shaft.translate(x, 0, 0) for x in spots]
@@ -160,15 +158,17 @@ def portico(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
     shapes += [box([span + 0.6 * k, 1.2 + 0.6 * k, 0.17]).translate(0, 0, -0.17 * (k + 1) - 0.001) for k in range(4)]
     scene.bodies.append(Body(merge(shapes), stone))
     back = rng.uniform(0.8, 3.0)
-    scene.add_all(arched_wall(rng, span + 4, high + 1.5, back), ["wall"], 1.5)
+    scene.add_all(furniture.arched_wall(rng, span + 4, high + 1.5, back), ["wall"], 1.5)
     if rng.random() < 0.5:
         for x in spots[:-1]:
-            rail = blinds(rng, pitch - 0.5, 0.9)[0]
+            rail = furniture.blinds(rng, pitch - 0.5, 0.9)[0]
             scene.add(rail.translate(x + 0.25, 0, 0), "metal", 0.3)
     for _ in range(rng.integers(0, 5)):
         thing = (prism if rng.random() < 0.5 else random_solid)(rng).scale(rng.uniform(0.5, 1.1))
         scene.add(thing.translate(rng.uniform(-2.5, 2.5), rng.uniform(-3.0, -1.6), -0.68), "stone", 0.8)
-    floor = relief(rng, RELIEFS[rng.integers(2)], 16.0, 260) if rng.random() < 0.4 else box([30, 30, 0.1])
+    floor = box([30, 30, 0.1])
+    if rng.random() < 0.4:
+        floor = reliefs.relief(rng, reliefs.RELIEFS[rng.integers(2)], 16.0, 260)
     scene.add(floor.scale([1, 1, 0.15]).translate(0, 0, -0.7), "stone", 2.0)
     scene.add(box([40, 0.1, 30]).translate(0, back + 3, -5), "wall", 3.0)
 
@@ -185,13 +185,13 @@ def shapes(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
     if count == 1:
         places = [rng.uniform(-0.1, 0.1, 3)]
     else:
-        spots = scatter(rng, np.full(2, 1.5), count, 0.45)
+        spots = furniture.scatter(rng, np.full(2, 1.5), count, 0.45)
         places = [np.array([x, rng.uniform(-0.4, 0.4), z]) for x, z in spots]
     for place in places:
         thing = random_solid(rng) if rng.random() < 0.8 else creature(rng, 72)
         thing = place_on_ground(thing).translate(0, 0, -0.4).rotate(random_rotation(rng)).scale(rng.uniform(0.5, 1.0))
         scene.add(thing.translate(*place), "any", 0.5)
-    backdrop(rng, scene, rng.uniform(0.7, 1.6), -1.2)
+    furniture.backdrop(rng, scene, rng.uniform(0.7, 1.6), -1.2)
 
     def views(draw: np.random.Generator) -> Viewpoint:
         eye = draw.uniform([-0.8, -2.6, -0.3], [0.8, -1.7, 0.9])
@@ -205,14 +205,14 @@ def clutter(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
     depth = rng.uniform(0.5, 1.0)
     for _ in range(rng.integers(14, 44)):
         place = rng.uniform([-1.1 * depth, -0.2, 0], [1.1 * depth, depth, 0])
-        shapes, families = random_object(rng)
+        shapes, families = furniture.random_object(rng)
         turn = random_rotation(rng) if rng.random() < 0.25 else rotation_about(2, rng.uniform(0, 360))
         place[2] = 0.55 * place[1] * rng.random() + (0.15 if rng.random() < 0.3 else 0.0)
         scene.add_all([shape.rotate(turn).translate(*place) for shape in shapes], families, 0.3)
     for k in range(int(rng.integers(0, 4))):  # boxes in the background
         block = box(rng.uniform([0.4, 0.3, 0.2], [0.9, 0.5, 0.9])).turn(2, rng.uniform(-30, 30))
         scene.add(block.translate((k - 1.5) * 0.6, depth * rng.uniform(0.5, 1.0), 0.0), "print", 0.5)
-    backdrop(rng, scene, depth + rng.uniform(0.3, 0.8), -0.002)
+    furniture.backdrop(rng, scene, depth + rng.uniform(0.3, 0.8), -0.002)
 
     def views(draw: np.random.Generator) -> Viewpoint:
         eye = draw.uniform([-0.7, -1.7, 0.3], [0.7, -0.9, 1.3])
@@ -223,7 +223,7 @@ def clutter(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
 
 def shelves(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
     """Return a full bookcase seen from near, sometimes behind a curtain or a grille."""
-    parts = shelf(rng)
+    parts = furniture.shelf(rng)
     scene.add_all(parts, ["wood", "print", "any", "cloth", "any"], 0.4)
     scene.add(box([9, 0.1, 9]).translate(0, 0.35, -3), "wall", 1.0)
     scene.add(box([9, 9, 0.1]).translate(0, 0, -0.11), "wood", 1.0)
@@ -231,7 +231,7 @@ def shelves(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
         cloth = curtain(rng, 0.5, 2.4).translate(rng.choice([-0.75, 0.25]), -0.32, 0)
         scene.add(cloth, "cloth", 0.3)
     if rng.random() < 0.2:
-        scene.add(blinds(rng, 1.6, 2.4)[0].translate(-0.8, -0.3, 0), "metal", 0.3)
+        scene.add(furniture.blinds(rng, 1.6, 2.4)[0].translate(-0.8, -0.3, 0), "metal", 0.3)
     if rng.random() < 0.5:
         soft = blanket(rng, rng.uniform(0.4, 0.8, 2), 0.15).turn(0, rng.uniform(0, 30))
         scene.add(soft.translate(rng.uniform(-0.5, 0.5), -0.7, 0), "cloth", 0.4)
