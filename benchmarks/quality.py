@@ -46,8 +46,7 @@ from dsr.degradation.random_fields import field_of, near_steps
 from dsr.geometry.camera import Camera, RangeType
 from dsr.geometry.hole_size import window_maxima
 from dsr.geometry.surface import angle_between, depth_to_normals, length
-from dsr.inference import upsample_surface
-from dsr.inference.defaults import Fill
+from dsr.inference import Fill, upsample_surface
 from dsr.inference.sequences import View, fuse_views
 from dsr.methods.base import Surface
 from dsr.methods.classical.bilateral import filter_bilateral

@@ -232,7 +232,7 @@ def test_repeated_command_does_nothing_and_new_outputs_need_no_new_depth(pair, t
     assert of(pair, out, *DEPTH_ONLY) == 0
     assert "photo: complete already" in capsys.readouterr().out
     assert times == {name: (out / name).stat().st_mtime_ns for name in files_in(out)}
-    monkeypatch.setattr("dsr.inference.AnyRatio.upsample", None)
+    monkeypatch.setattr("dsr.inference.any_ratio.AnyRatio.upsample", None)
     assert of(pair, out, *BICUBIC, "--only", "normals") == 0
     assert files_in(out) == {"depth.png", "depth_metres.tiff", "normals.png", "info.json"}
     assert files_in(out) == {*info(out)["files"], "info.json"}

@@ -11,8 +11,9 @@ from torch import Tensor
 import dsr
 from dsr.geometry.camera import Camera
 from dsr.geometry.resampling import resize_inverse_depth
-from dsr.inference import Plan, find_filled, plan_for, upsample_surface
-from dsr.inference.resizing import resize_nearest
+from dsr.inference import upsample_surface
+from dsr.inference.plausibility import find_filled
+from dsr.inference.resizing import Plan, plan_for, resize_nearest
 from dsr.inference.working_size import enlarged_by
 from dsr.methods.recipe import read_recipe
 

@@ -10,7 +10,8 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.inference import AnyRatio, Selection, upsample_surface, upsampler
+from dsr.inference import upsample_surface, upsampler
+from dsr.inference.any_ratio import AnyRatio, Selection
 from dsr.methods.base import Method, Surface
 from dsr.methods.recipe import Recipe, Run, read_recipe
 from dsr.sample import DepthSample

@@ -20,8 +20,8 @@ from dsr.app.upsample.sequence import camera_lr, nearest, vote
 from dsr.app.upsample.surface import Array, Surface
 from dsr.degradation.sensors import Identified
 from dsr.geometry.camera import Camera
-from dsr.inference import upsampler
-from dsr.inference.defaults import DEFAULT, WIDEST, Fill
+from dsr.inference import DEFAULT, WIDEST, Fill
+from dsr.inference.any_ratio import upsampler
 from dsr.inference.sequences import View
 from dsr.io.files import python_messages
 from dsr.io.inputs import Picture

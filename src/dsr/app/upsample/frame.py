@@ -18,7 +18,9 @@ from dsr.app.upsample.request import UpsampleRequest, Upsampling, files_of, inpu
 from dsr.app.upsample.sequence import FrameSequence
 from dsr.app.upsample.stored import INFO, warnings_of
 from dsr.degradation.sensors import Identified
-from dsr.inference import AnyRatio, enlarged_by, find_filled, find_sensor
+from dsr.inference.any_ratio import AnyRatio
+from dsr.inference.plausibility import find_filled
+from dsr.inference.working_size import enlarged_by, find_sensor
 from dsr.io.inputs import Picture, read_picture
 from dsr.io.pairs import Pair
 from dsr.methods.base import MapNoise, Surface

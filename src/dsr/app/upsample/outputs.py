@@ -21,7 +21,7 @@ from dsr.app.upsample.parts import ERRORS, FILES, METRES, PARTS, Results
 from dsr.app.upsample.stored import INFO, read_depth, read_errors, read_info
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import ERROR_SHARE, FLATNESS
-from dsr.inference import Plan
+from dsr.inference.resizing import Plan
 from dsr.io.depth_files import storable, write_depth_file
 from dsr.io.encoding import IN_METRES, Encoding, encode
 from dsr.io.exports import (

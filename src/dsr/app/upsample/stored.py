@@ -15,7 +15,7 @@ import torch
 from dsr.app.upsample.parts import ERRORS, METRES, Part, Results
 from dsr.evaluation.results import load_errors
 from dsr.geometry.camera import Camera
-from dsr.inference import find_filled
+from dsr.inference.plausibility import find_filled
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import INPUT, read_input
 from dsr.io.frames import UPS

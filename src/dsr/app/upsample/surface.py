@@ -23,7 +23,7 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.lights import FIGURE_LIGHT, Direction, direction_of
 from dsr.geometry.mesh import Mesh, triangulate, vertex_normals
 from dsr.geometry.surface import render_for_viewing, shade
-from dsr.inference import Plan
+from dsr.inference.resizing import Plan
 from dsr.io.exports import normal_strips
 from dsr.io.files import python_messages
 from dsr.io.inputs import Picture
