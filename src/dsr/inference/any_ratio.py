@@ -25,6 +25,7 @@ from dsr.inference.resizing import (
     Plan,
     at_factors,
     at_ratio,
+    cropped,
     padded,
     plan_for,
     resize_nearest,
@@ -163,13 +164,10 @@ class AnyRatio(Method):
             rgb: (3, H, W) floating point, in [0, 1].
             depth: (1, h, w) orthogonal depth in metres, NaN in holes.
             camera: the photo's; only interpolation and deep image priors depend on it.
-            progress: is called with the number of parts done and their total.
             sensor: what measured the map: of :func:`~dsr.inference.find_sensor`, or its argument; None for none. No
-                expected error is less than what remains of the least noise that the sensor is known to have; a
-                systematic error of which its maker states a limit is added to it, as independent errors add. Where it
-                counts disparity, and the noise of the map is correlated over 5 pixels or more, ``facets`` without a
-                scale is given how strong the noise is and that it grows with the square of the distance, unless
-                ``noise`` is set.
+                expected error is less than what remains of the sensor's least noise, and a systematic error of which
+                its maker states a limit is added. If it counts disparity, see also
+                :func:`~dsr.inference.working_size.known_noise`.
             estimate_errors: whether there are expected errors for a method that states none.
 
         Returns:
@@ -184,20 +182,18 @@ class AnyRatio(Method):
         given, outliers = _invert(depth)
         inverse, factor, scale = self._at_own_size(given, size_of(rgb), planned)
         valid = (given if size_of(inverse) == size_of(rgb) else inverse).isfinite()  # but for repeated pixels
-        settled, doubt = settle_holes(inverse, rgb, self._small_holes(inverse.isfinite(), camera))
+        settled = settle_holes(inverse, rgb, self._small_holes(inverse.isfinite(), camera))
         if factor > 1:
-            inverse_lr = Downsampling("box")(pad_inverse_depth(settled, factor), factor)
-            found = padded(
-                lambda photo, view: self._upsample(photo, inverse_lr, view, factor, progress),
-                factor, rgb, inverse_lr, camera,
-            )  # fmt: skip
+            inverse_lr = Downsampling("box")(pad_inverse_depth(settled.inverse, factor), factor)
+            whole, view = padded(rgb, camera, factor, size_of(inverse_lr))
+            found = cropped(self._upsample(whole, inverse_lr, view, factor, progress), camera)
         elif self._may_reduce:
-            found = self._at_working_size(rgb, inverse, settled, camera, sensor, progress)
+            found = self._at_working_size(rgb, inverse, settled.inverse, camera, sensor, progress)
         else:
-            found = self._upsample(rgb, settled, camera, scale, progress)
+            found = self._upsample(rgb, settled.inverse, camera, scale, progress)
         expect_some_depth(found.inverse, self.recipe.name)  # as good as of the depth: 0 and infinity change places
         photo = None if is_told_clean(self.recipe) else rgb.to(found.inverse.device)
-        surface = _in_depth(found, inverse, Settled(settled, doubt), photo, camera, sensor, estimate=estimate_errors)
+        surface = _in_depth(found, inverse, settled, photo, camera, sensor, estimate=estimate_errors)
         if self._fill != "all" and not bool(valid.all()):
             left = ~valid if self._fill == "none" else ~valid & ~self._small_holes(valid, camera)
             holes = resize_nearest(left, size_of(rgb)).to(surface.depth.device)
@@ -237,16 +233,11 @@ class AnyRatio(Method):
         else:
             inverse_lr = reduce_by_medians(pad_inverse_depth(inverse, factor), factor)
             ratio = factor * camera.width / inverse.shape[-1]
-            found = padded(
-                lambda photo, view: self._upsample(photo, inverse_lr, view, None, progress, known),
-                ratio, rgb, inverse_lr, camera,
-            )  # fmt: skip
+            photo, view = padded(rgb, camera, ratio, size_of(inverse_lr))
+            found = cropped(self._upsample(photo, inverse_lr, view, None, progress, known), camera)
             if ratio > USUAL_SCALE:  # weights for larger ratios leave more waves on calm surfaces
-                smoother = padded(
-                    lambda photo, view: at_ratio(self._method(USUAL_SCALE), photo, inverse_lr, view, None, known),
-                    ratio, rgb, inverse_lr, camera,
-                )  # fmt: skip
-                found = mix_where_calm(found, smoother, measured, reach=round(ratio / 4))
+                smoother = at_ratio(self._method(USUAL_SCALE), photo, inverse_lr, view, None, known)
+                found = mix_where_calm(found, cropped(smoother, camera), measured, reach=round(ratio / 4))
             # what the network has found is of the smaller map
             found = found._replace(noise=noise and noise._replace(reduced=factor))
         if noise is None or found.spread is None or (factor == 1 and noise.extent < CORRELATED):

@@ -10,7 +10,7 @@ docs/measurements/facets.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -173,14 +173,16 @@ def at_factors(
     return surface._replace(inverse=resize_inverse_depth(surface.inverse, size), spread=spread, angle=angle)
 
 
-def padded(
-    run: Callable[[Tensor, Camera], InverseSurface], ratio: float, rgb: Tensor, inverse: Tensor, camera: Camera
-) -> InverseSurface:
-    """Apply ``run`` to the photo padded to ``ratio`` times the size of the map, and crop the result."""
-    height, width = (max(round(ratio * n), m) for n, m in zip(size_of(inverse), size_of(rgb), strict=True))
-    padding = (0, width - rgb.shape[-1], 0, height - rgb.shape[-2])  # at the right and the bottom
+def padded(rgb: Tensor, camera: Camera, ratio: float, size_lr: Size) -> tuple[Tensor, Camera]:
+    """Return a photo padded at the right and the bottom to ``ratio`` times the size of a map, and its camera."""
+    height, width = (max(round(ratio * n), m) for n, m in zip(size_lr, size_of(rgb), strict=True))
+    padding = (0, width - rgb.shape[-1], 0, height - rgb.shape[-2])
     photo = functional.pad(rgb[None], padding, mode="replicate")[0] if any(padding) else rgb
-    found = run(photo, Camera(width, height, camera.fx, camera.fy, camera.cx, camera.cy))
+    return photo, Camera(width, height, camera.fx, camera.fy, camera.cx, camera.cy)
+
+
+def cropped(found: InverseSurface, camera: Camera) -> InverseSurface:
+    """Return a result for a padded photo without the padding."""
     return found.map(lambda values: values[..., : camera.height, : camera.width])
 
 
