@@ -179,14 +179,12 @@ class ResultFolder:
         if not self.reusable:
             return None
         try:
-            depth = torch.from_numpy(read_depth(self.path, camera))[None]
+            maps = [read_depth(self.path, camera)]
+            if errors or (self.path / ERRORS).is_file():
+                maps += read_errors(self.path, camera)
         except (OSError, ValueError):
             return None
-        try:
-            depth_error, angle_error = read_errors(self.path, camera)
-        except (OSError, ValueError):
-            return None if errors else Surface(depth)
-        return Surface(depth, torch.from_numpy(depth_error)[None], torch.from_numpy(angle_error)[None])
+        return Surface(*(torch.from_numpy(each)[None] for each in maps))
 
     def store(self, result: Result, seconds: Mapping[str, float], *, reused: bool = False) -> list[Assumption]:
         """Write the parts of a result and ``info.json``, which says when it is complete; return notes on the parts.
@@ -325,7 +323,7 @@ def _write_maps(folder: Path, result: Result) -> dict[str, Output]:
 def _write_depth(folder: Path, result: Result) -> Output:
     """Write the depth in metres without loss, and in the output's encoding if that is another one."""
     depth, encoding = result.surface.depth, result.encoding
-    write_depth_file(folder / METRES, depth[0].float().cpu().numpy())
+    write_depth_file(folder / METRES, depth[0].numpy())
     if encoding is IN_METRES:
         return Output((METRES,))
     values, lost = encode(depth, encoding, result.picture.camera)

@@ -95,21 +95,9 @@ class Reporter:
 
 
 def run(request: UpsampleRequest, console: Console) -> list[str]:
-    """Upsample all pictures of a request, and return the problems, one line each.
-
-    Raises:
-        ValueError: the pairs cannot be determined, frames lack poses that a part needs, a file would be written outside
-            of the folder of results, or a command with other settings is at work in it.
-        TargetError: a link, a device, a pipe or a socket is in the place of a file.
-
-    """
+    """Upsample all frames of a request, and return the problems, one line each."""
     frames = find_frames(request)
-    for part in request.results.of_all:
-        if part.poses:
-            posed = _posed(request, frames)
-            expect_poses(part.name, posed)
-            if not all(posed.values()):  # a single one
-                show(console, f"--with {part.name}: the frame has no pose{_UNPOSED.get(part.name, '')}")
+    _check_poses(request, frames, console)
     with contextlib.ExitStack() as stack:
         if not request.results.dry_run:
             try:
@@ -121,7 +109,7 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
 
 
 def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str]:
-    """Upsample frames, and return the problems."""
+    """Upsample frames in a folder of this command's own, and return the problems."""
     wanted, shard, pairs = request.results, request.frames.shard, frames.found.pairs
     started = time.monotonic()
     written = [*(name for part in wanted.of_all for name in part.files), EXPORTS]
@@ -208,20 +196,24 @@ def _remote(job: tuple[Pair, Path]) -> tuple[Done, list[Message]]:
     return _work(*job, messages.append, Progress()), messages
 
 
-def _posed(request: UpsampleRequest, frames: Frames) -> dict[str, bool]:
-    """Return whether each frame has a pose, of the file or of its capture; frames that fail count."""
+def _check_poses(request: UpsampleRequest, frames: Frames, console: Console) -> None:
+    """Refuse frames without a pose, of the file or the capture, for a part that needs one; one alone gets a note."""
+    parts = [part for part in request.results.of_all if part.poses]
+    if not parts:
+        return
     if request.frames.trajectory is not None:
         given = read_poses(request.frames.trajectory).assign(frames.whole)
-        return {pair.name: pair.name in given for pair in frames.whole}
-
-    def posed(pair: Pair) -> bool:
-        try:
-            geometry, _ = read_geometry(pair, pixels_in_header(pair.rgb) or USUAL_SIZE, request.reading)
-        except (ValueError, OSError):
-            return True
-        return geometry.pose is not None
-
-    return {pair.name: posed(pair) for pair in frames.whole}
+        posed = {pair.name: pair.name in given for pair in frames.whole}
+    else:
+        posed = {pair.name: True for pair in frames.whole}
+        for pair in frames.whole:
+            with contextlib.suppress(ValueError, OSError):  # it is reported as a frame of its own
+                geometry, _ = read_geometry(pair, pixels_in_header(pair.rgb) or USUAL_SIZE, request.reading)
+                posed[pair.name] = geometry.pose is not None
+    for part in parts:
+        expect_poses(part.name, posed)
+        if not all(posed.values()):  # a single one
+            show(console, f"--with {part.name}: the frame has no pose{_UNPOSED[part.name]}")
 
 
 def _show_found(request: UpsampleRequest, frames: Frames, console: Console) -> None:
@@ -309,7 +301,7 @@ class FrameWork:
         if kept is None:
             with progress.task("steps") as step:
                 surface = self._upsampler.upsample(picture.rgb, picture.depth_lr, picture.camera, step, sensor)
-            surface = as_stored(surface.map(lambda values: values.cpu()))
+            surface = as_stored(surface)
             tell(_describe(surface, how))
             surface = surface.without_dubious(wanted.max_error / 100) if wanted.certain else surface
         else:
@@ -333,7 +325,7 @@ class FrameWork:
     def _is_to_do(self, pair: Pair, target: Path) -> bool:
         """Return whether a frame is not complete; one that cannot be read is reported when its turn comes."""
         try:
-            return not (target / INFO).is_file() or not self._is_done(self._folder(pair, target))
+            return not ((target / INFO).is_file() and self._is_done(self._folder(pair, target)))
         except (ValueError, OSError):
             return True
 
