@@ -122,14 +122,12 @@ class FrameSequence:
     def __init__(
         self, pairs: Sequence[Pair], read: Callable[[Pair], Picture], neighbours: int, poses: Path | None
     ) -> None:
-        self._read, self._count, self._file = read, neighbours, poses
+        self._read, self._count, self._file, self.given = read, neighbours, poses, poses is not None
         self._poses: Mapping[str, np.ndarray] | None = None
-        self.given = poses is not None
         self._matched: list[Assumption] = []
         if poses is not None:
             trajectory = read_poses(poses)
             self._poses = trajectory.assign(pairs)
-            self._without = len(pairs) - len(self._poses)
             if len(trajectory.poses) != len(pairs):
                 counts = f"{len(trajectory.poses)} poses for {len(pairs)} frames"
                 self._matched.append(Assumption(f"{poses.name}: {counts}, by their times or numbers"))
@@ -148,21 +146,6 @@ class FrameSequence:
         found = nearest(place, len(folder), self._count, lambda number: poses is None or folder[number].name in poses)
         return [folder[number] for number in found]
 
-    def with_pose(self, pair: Pair, picture: Picture) -> Picture:
-        """Return a frame with its pose from the file, if any; a ValueError if neighbours vote and it has no pose."""
-        notes = list(self._matched)
-        if self._poses is not None:
-            picture = replace(picture, pose=self._poses.get(pair.name), up="")
-        if picture.pose is None and self._count:
-            where = "this capture has none; give --poses" if self._file is None else f"{self._file} has none"
-            raise ValueError(f"--neighbours: expected a pose for each frame, {where}")
-        if picture.pose is None and self._file is not None and self._without >= LIMITS["poses-missing"]:
-            detail = f"{self._without} of {len(self._places)} frames have none"
-            notes.append(
-                Assumption(f"{self._file.name} has no pose of this frame", detail, "poses-missing", self._without)
-            )
-        return replace(picture, assumptions=(*picture.assumptions, *notes)) if notes else picture
-
     def fault(self, recording: Sequence[Pair]) -> Assumption | None:
         """Return a warning if the poses of a recording do not fit a sample of its frames."""
         frames = [pair for pair in recording if self._poses is None or pair.name in self._poses]
@@ -177,9 +160,19 @@ class FrameSequence:
         return check_poses(len(frames), load)
 
     def fuse(self, pair: Pair, picture: Picture) -> Picture:
-        """Return a frame with its pose, its depth fused with that of its neighbours."""
-        picture = self.with_pose(pair, picture)
-        if not self._count or picture.pose is None:
+        """Return a frame with its pose, its depth fused with its neighbours', which need one."""
+        notes = [*picture.assumptions, *self._matched]
+        if self._poses is not None:
+            picture = replace(picture, pose=self._poses.get(pair.name), up="")
+        if picture.pose is None and self._count:
+            where = "this capture has none; give --poses" if self._file is None else f"{self._file} has none"
+            raise ValueError(f"--neighbours: expected a pose for each frame, {where}")
+        if picture.pose is None and self._file is not None:
+            missing = len(self._places) - len(self._poses or ())
+            text, detail = f"{self._file.name} has no pose of this frame", f"of {len(self._places)} frames have none"
+            notes.append(Assumption(text, f"{missing} {detail}", "poses-missing", missing))
+        picture = replace(picture, assumptions=tuple(notes))
+        if not self._count:
             return picture
         others, views, failed = self.neighbours(pair), [], 0
         for other in others:

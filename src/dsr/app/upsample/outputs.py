@@ -81,18 +81,6 @@ class Result:
         """The shares of the pixels, see :meth:`dsr.methods.base.Surface.shares`."""
         return self.surface.shares(self.wanted.max_error / 100)
 
-    @functools.cached_property
-    def certain(self) -> tuple[Tensor | None, tuple[Assumption, ...]]:
-        """The depth, (1, H, W), without pixels that are likely to be wrong, None if none is left; and notes."""
-        limit, notes = self.wanted.max_error / 100, list[Assumption]()
-        depth, share = self.surface.without_dubious(limit).depth, self.shares.get("dubious", 0.0)
-        if share >= _WORTH_SAYING:
-            text = f"{share:.1%} of the pixels, expected to be off by more than {limit:.1%} of their depth"
-            notes.append(Assumption("left out of cloud and mesh", text))
-        if bool(depth.isfinite().any()):
-            return depth, tuple(notes)
-        return None, (*notes, Assumption("no cloud and no mesh", "no pixel is left"))
-
 
 class Output(NamedTuple):
     """What a part wrote: the names of the files, notes for the user, and how much of a shape."""
@@ -339,14 +327,19 @@ def _write_depth(folder: Path, result: Result) -> Output:
 
 
 def _write_shapes(folder: Path, result: Result) -> dict[str, Output]:
-    """Write the meshes and the cloud of what is certain."""
+    """Write the meshes and the cloud, of the pixels that are not likely to be wrong."""
     names = [part.name for part in result.wanted.of_frame if part.shape]
     if not names:
         return {}
-    depth, notes = result.certain
-    written = {name: Output((), notes) for name in names}
-    if depth is None:
-        return written
+    limit, notes = result.wanted.max_error / 100, list[Assumption]()
+    if (share := result.shares.get("dubious", 0.0)) >= _WORTH_SAYING:
+        text = f"{share:.1%} of the pixels, expected to be off by more than {limit:.1%} of their depth"
+        notes.append(Assumption("left out of cloud and mesh", text))
+    depth = result.surface.without_dubious(limit).depth
+    if not bool(depth.isfinite().any()):
+        notes.append(Assumption("no cloud and no mesh", "no pixel is left"))
+        return {name: Output((), notes) for name in names}
+    written: dict[str, Output] = {}
     picture, wanted, filled = result.picture, result.wanted, result.surface.filled
     if meshes := [name for name in names if name != "cloud"]:
         files = [PARTS[name].files[0] for name in meshes]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import functools
 import json
 import os
@@ -44,7 +43,6 @@ _UNPOSED = {  # what is written of a single frame without a pose, by part
     "gaussian": ": images, depths and depth_params.json are written, and no sparse model; --poses gives one",
     "nerfstudio": ": it stands at the origin",
 }
-_READ_ONLY = (errno.EACCES, errno.EPERM, errno.EROFS)
 _SHOWN = 5  # number of names that a line lists; further ones are only counted
 _KEPT = 2**26  # numbers in the photos that were read last and are kept
 _WHITE = 1.5  # noise that is alike over fewer pixels counts as white
@@ -67,8 +65,7 @@ class Reporter:
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._counts: Counter[str] = Counter()
-        self._warned: dict[str, Assumption] = {}
+        self._notes: dict[str, list[Assumption]] = {}  # of the frames, by their statement
 
     def tell(self, message: Message) -> None:
         """Show a line, or the notes that no earlier frame had."""
@@ -76,35 +73,28 @@ class Reporter:
             show(self._console, message)
             return
         for note in message:
-            if not self._counts[note.statement]:
+            if note.statement not in self._notes:
                 show(self._console, f"  {note}")
-            self._counts[note.statement] += 1
-            if note.code:
-                self._warned.setdefault(note.statement, note)
+            self._notes.setdefault(note.statement, []).append(note)
 
-    @property
     def warnings(self) -> list[dict[str, Any]]:
-        """The warnings as values for JSON, each once, as of the first of so many ``pictures``."""
-        return [{**note.record(), "pictures": self._counts[text]} for text, note in self._warned.items()]
+        """Return the warnings as values for JSON, each once, as of the first of so many ``pictures``."""
+        return [{**notes[0].record(), "pictures": len(notes)} for notes in self._notes.values() if notes[0].code]
 
     def summary(self, pictures: int) -> None:
         """Show the notes that apply to some of the pictures only."""
-        for text, count in self._counts.items():
-            if count < pictures:
-                show(self._console, f"  {count} of {pictures} pictures: {text}")
+        for text, notes in self._notes.items():
+            if len(notes) < pictures:
+                show(self._console, f"  {len(notes)} of {pictures} pictures: {text}")
 
 
 def run(request: UpsampleRequest, console: Console) -> list[str]:
     """Upsample all frames of a request, and return the problems, one line each."""
     frames = find_frames(request)
     _check_poses(request, frames, console)
-    with contextlib.ExitStack() as stack:
-        if not request.results.dry_run:
-            try:
-                stack.enter_context(at_work(request.results.output, json.dumps(request.settings, sort_keys=True)))
-            except OSError as error:
-                if error.errno not in _READ_ONLY:  # where all may be complete; what is written says so itself
-                    raise
+    if request.results.dry_run:
+        return _run(request, frames, console)
+    with at_work(request.results.output, json.dumps(request.settings, sort_keys=True)):
         return _run(request, frames, console)
 
 
@@ -148,7 +138,7 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
             "shard": str(shard),
             "outcomes": outcomes,
             "failed": [{"problem": problem, "frames": names} for problem, names in problems.items()],
-            "warnings": reporter.warnings,
+            "warnings": reporter.warnings(),
             "seconds": round(time.monotonic() - started, 3),
         }
         write_text(wanted.output / written[0], json.dumps(summary, indent=2) + "\n")
