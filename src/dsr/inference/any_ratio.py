@@ -71,15 +71,9 @@ class AnyRatio(Method):
     repeated ones are dropped instead. (With a tenth of the map missing, RMSE_v on Lucy is 0.127, against 0.142 or more
     with means, medians or planes of one surface.)
 
-    Args:
-        recipe: the method.
-        device: where to compute.
-        scale, fill, max_hole, working_size: see :class:`dsr.Upsampler`. Holes are pixels whose own depth, or whose
-            nearest low-resolution pixel, is missing. Without a working size ``facets`` chooses it, see
-            :mod:`dsr.inference.working_size`.
-        precision: dtype of the convolutions; None for the device's fast one where that costs no accuracy.
-        seed: of random numbers.
-
+    For the options see :class:`dsr.Upsampler`; holes are pixels whose own depth, or whose nearest low-resolution pixel,
+    is missing. ``precision`` is the dtype of the convolutions; None for the device's fast one where that costs no
+    accuracy.
     """
 
     def __init__(
@@ -155,20 +149,18 @@ class AnyRatio(Method):
         *,
         estimate_errors: bool = True,
     ) -> Surface:
-        """Upsample a depth map to the photo's size, with the expected errors.
+        """Upsample a depth map, (1, h, w) in metres with NaN in holes, to the size of a photo, (3, H, W) in [0, 1].
 
-        ``facets`` says them; for other methods they are estimated, see :mod:`dsr.inference.plausibility`. The depth map
-        is registered to the photo: the same view and field of view, outer edge on outer edge.
+        Both are registered: the same view and field of view, outer edge on outer edge. ``facets`` states the expected
+        errors; for other methods they are estimated, see :mod:`dsr.inference.plausibility`, unless not
+        ``estimate_errors``.
 
         Args:
-            rgb: (3, H, W) floating point, in [0, 1].
-            depth: (1, h, w) orthogonal depth in metres, NaN in holes.
             camera: the photo's; only interpolation and deep image priors depend on it.
             sensor: what measured the map: of :func:`~dsr.inference.find_sensor`, or its argument; None for none. No
                 expected error is less than what remains of the sensor's least noise, and a systematic error of which
                 its maker states a limit is added. If it counts disparity, see also
                 :func:`~dsr.inference.working_size.known_noise`.
-            estimate_errors: whether there are expected errors for a method that states none.
 
         Returns:
             Depth, (1, H, W) float32 in metres, its expected errors, and which depth is filled in, on the device of
@@ -313,11 +305,7 @@ def upsampler(
 ) -> AnyRatio:
     """Return a method of ``conf/method`` for depth maps of any size, which loads its weights once.
 
-    Args:
-        method: the name of one in ``conf/method``.
-        scale: see :class:`AnyRatio`, also for ``fill``, ``max_hole`` and ``working_size``.
-        settings: arguments of the method that differ from its file, by name.
-        device: ``auto`` for a GPU if there is one, or a device as torch names it.
+    ``settings`` are arguments of the method that differ from its file; for the others see :class:`dsr.Upsampler`.
 
     Example:
         >>> import torch

@@ -259,10 +259,11 @@ class Upsampler:
                 near = nearest(place, max(kept) + 1, neighbours, views.__contains__)
                 voting = [views[number] for number in near]
             with naming(f"frame {place}"), python_messages():
-                yield self._upsample(picture, device, voting, look=place == 0)
+                surface = self._upsample(picture, device, voting, look=place == 0)
+            yield surface
             place += 1
-            for frames_before in (kept, views):
-                frames_before.pop(place - neighbours - 1, None)
+            kept.pop(place - neighbours - 1, None)
+            views.pop(place - neighbours - 1, None)
 
     def _upsample(
         self,

@@ -167,12 +167,13 @@ class ResultFolder:
         if not self.reusable:
             return None
         try:
-            maps = [read_depth(self.path, camera)]
+            surface = Surface(torch.from_numpy(read_depth(self.path, camera))[None])
             if errors or (self.path / ERRORS).is_file():
-                maps += read_errors(self.path, camera)
+                depth_error, angle_error = (torch.from_numpy(each)[None] for each in read_errors(self.path, camera))
+                surface = surface._replace(depth_error=depth_error, angle_error=angle_error)
         except (OSError, ValueError):
             return None
-        return Surface(*(torch.from_numpy(each)[None] for each in maps))
+        return surface
 
     def store(self, result: Result, seconds: Mapping[str, float], *, reused: bool = False) -> list[Assumption]:
         """Write the parts of a result and ``info.json``, which says when it is complete; return notes on the parts.

@@ -158,6 +158,7 @@ def work_through(request: UpsampleRequest, frames: Frames, tell: Tell, progress:
         for job in progress.track(jobs, "upsample", label=lambda job: job[0].name, lines=False):
             yield work(*job, tell, progress)
         return
+    del work  # and the frames that it has read
     left, threads = list(jobs), max(1, (os.cpu_count() or 1) // workers)
     with Pool(workers, _begin, (request, frames), threads, progress.say) as pool:
         results = pool.results(_remote, jobs)
