@@ -50,8 +50,7 @@ from dsr.degradation.random_fields import field_of, near_steps
 from dsr.geometry.camera import Camera, RangeType
 from dsr.geometry.hole_size import window_maxima
 from dsr.geometry.surface import angle_between, depth_to_normals, length
-from dsr.inference import upsample_surface, upsampler
-from dsr.inference.defaults import Fill
+from dsr.inference import Fill, upsample_surface, upsampler
 from dsr.inference.sequences import View, fuse_views
 from dsr.io.images import read_numbers
 from dsr.methods.base import Surface

@@ -33,7 +33,8 @@ from dsr.degradation.downsampling import Downsampling
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.camera import Camera
 from dsr.geometry.planes import inverse_votes
-from dsr.inference import plan_for, upsampler
+from dsr.inference import upsampler
+from dsr.inference.resizing import plan_for
 from dsr.inference.working_size import left_of, limit_to_noise
 from dsr.io.cameras import read_any_camera
 from dsr.io.depth_files import far_marks, read_depth_file

@@ -1,13 +1,13 @@
-"""``dsr upsample`` on captures: what is printed, what info.json keeps, confidence, units of folders, refusals."""
+"""``dsr upsample`` on captures: what is printed, what info.json keeps, confidence, refusals."""
 
 import captures
 import numpy as np
 import pytest
-from captures import FRAMES, INTRINSICS, SIZE_LR
+from captures import FRAMES, INTRINSICS
 from PIL import Image
 from upsampling import info, refused_line, upsample
 
-from dsr.io.depth_files import read_depth_file, write_depth_file
+from dsr.io.depth_files import read_depth_file
 
 DEPTH_ONLY = ("--method", "bicubic", "--only", "depth")
 
@@ -87,31 +87,3 @@ def test_confidence_that_does_not_fit_is_refused_in_one_line(lists, capsys):
     (lists / "sure" / "confidence_001.png").unlink()
     message = refused_line(capsys, upsample(*given, *sure, "--min-confidence", 0.5))
     assert "expected a map for each of the 2 depth maps, there is none for 1, such as 1" in message
-
-
-def test_resumed_folder_of_millimetre_floats_keeps_its_unit(tmp_path, monkeypatch):
-    """The first map is far and says millimetres; the second is so near that alone it would be taken for metres."""
-    folder = tmp_path / "scan"
-    (folder / "depth").mkdir(parents=True)
-    for number, far in enumerate((1500.0, 150.0, 180.0)):
-        captures.save(folder / "rgb" / f"{number}.png", captures.photo(number))
-        np.save(folder / "depth" / f"{number}.npy", np.full(SIZE_LR, far, np.float32))
-
-    def write_first_only(path, values):
-        if path.parent.name != "0":
-            raise KeyboardInterrupt
-        write_depth_file(path, values)
-
-    assert upsample(folder, "-o", tmp_path / "whole", *DEPTH_ONLY) == 0
-    out = tmp_path / "resumed"
-    with monkeypatch.context() as patch:
-        patch.setattr("dsr.app.upsample.outputs.write_depth_file", write_first_only)
-        assert upsample(folder, "-o", out, *DEPTH_ONLY) == 130
-    assert [path.parent.name for path in out.rglob("depth*")] == ["0", "0"]
-    assert upsample(folder, "-o", out, *DEPTH_ONLY) == 0
-    for number, metres in enumerate((1.5, 0.15, 0.18)):
-        for place in (tmp_path / "whole", out):
-            assert info(place / str(number))["input_depth"]["unit"] == 0.001
-            np.testing.assert_allclose(read_depth_file(place / str(number) / "depth_metres.tiff"), metres, rtol=0.03)
-        reported = [{**info(place / str(number)), "seconds": None} for place in (tmp_path / "whole", out)]
-        assert reported[0] == reported[1]

@@ -137,32 +137,24 @@ def test_glass_is_said_and_a_robot_gets_no_depth_there(pair, tmp_path, capsys, m
     assert depth[:, 16:].any()
 
 
-@pytest.mark.parametrize(("suffix", "factor", "dtype"), [("exr", 1000, "f4"), ("npz", 1, "f8")])
+@pytest.mark.parametrize(("suffix", "factor", "dtype"), [("exr", 1000, "f4"), ("npz", 1, "f8"), ("exr", 1, "f4")])
 def test_result_has_the_inputs_format_type_unit_and_holes(pair, tmp_path, suffix, factor, dtype):
-    photo, _, values = pair
-    metres = np.where(values == 0, np.nan, values / 1000)
-    depth = tmp_path / f"d.{suffix}"
+    metres = np.where(pair[2] == 0, np.nan, pair[2] / 1000)
+    depth, out, options = tmp_path / f"d.{suffix}", tmp_path / "out", (*DEPTH_ONLY, "--fill", "none")
     write_depth_file(depth, (metres * factor).astype(dtype))
-    out = tmp_path / "out"
-    assert of((photo, depth), out, *DEPTH_ONLY, "--fill", "none") == 0
-    stored = read_depth_file(out / f"depth.{suffix}")
+    assert of((pair[0], depth), out, *options) == 0
     result = read_depth_file(out / "depth_metres.tiff")
+    assert np.isnan(result[22:26, 14:22]).all()
+    assert 0 < np.isnan(result).mean() < 0.1
+    if (factor, dtype) == (1, "f4"):  # metres are written once
+        assert files_in(out) == {"depth_metres.tiff", "info.json"}
+        assert info(out)["depth_file"] == {
+            "suffix": ".tiff", "dtype": "float32", "unit": 1.0, "hole": "nan", "range_type": "orthogonal",
+        }  # fmt: skip
+        assert of((pair[0], depth), out, *options, "--overwrite", "--format", "exr") == 0
+    stored = read_depth_file(out / f"depth.{suffix}")
     assert (stored.dtype, stored.shape) == (np.dtype(dtype), (64, 64))
     np.testing.assert_allclose(stored / factor, result, rtol=1e-6)
-    assert np.isnan(stored[22:26, 14:22]).all()
-    assert 0 < np.isnan(stored).mean() < 0.1
-
-
-def test_floats_in_metres_are_written_once_unless_a_format_is_chosen(pair, tmp_path):
-    depth, out = tmp_path / "d.exr", tmp_path / "out"
-    write_depth_file(depth, np.where(pair[2] == 0, np.nan, pair[2] / 1000).astype("f4"))
-    assert of((pair[0], depth), out, *DEPTH_ONLY) == 0
-    assert files_in(out) == {"depth_metres.tiff", "info.json"}
-    stored = {"suffix": ".tiff", "dtype": "float32", "unit": 1.0, "hole": "nan", "range_type": "orthogonal"}
-    assert (info(out)["depth_metres"], info(out)["depth_file"]) == ({"file": "depth_metres.tiff", **stored}, stored)
-    assert of((pair[0], depth), out, *DEPTH_ONLY, "--overwrite", "--format", "exr") == 0
-    assert files_in(out) == {"depth.exr", "depth_metres.tiff", "info.json"}
-    np.testing.assert_array_equal(*(read_depth_file(out / name) for name in ("depth.exr", "depth_metres.tiff")))
 
 
 def test_what_was_measured_and_what_was_filled_is_distinguished(pair, tmp_path, capsys):
@@ -232,7 +224,7 @@ def test_repeated_command_does_nothing_and_new_outputs_need_no_new_depth(pair, t
     assert of(pair, out, *DEPTH_ONLY) == 0
     assert "photo: complete already" in capsys.readouterr().out
     assert times == {name: (out / name).stat().st_mtime_ns for name in files_in(out)}
-    monkeypatch.setattr("dsr.inference.AnyRatio.upsample", None)
+    monkeypatch.setattr("dsr.inference.any_ratio.AnyRatio.upsample", None)
     assert of(pair, out, *BICUBIC, "--only", "normals") == 0
     assert files_in(out) == {"depth.png", "depth_metres.tiff", "normals.png", "info.json"}
     assert files_in(out) == {*info(out)["files"], "info.json"}
@@ -254,19 +246,21 @@ def test_result_of_other_settings_or_inputs_is_kept_unless_overwritten(pair, tmp
     assert files_in(out) == {"depth.npy", "depth_metres.tiff", "info.json"}
 
 
-def test_interrupted_run_resumes(pair, tmp_path, capsys, monkeypatch):
+def test_interrupted_run_resumes_and_keeps_no_part_of_other_settings(pair, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
+    assert of(pair, out, *BICUBIC, "--only", "depth,filled", "--fov", "70") == 0
 
     def interrupt(*_):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr("dsr.app.upsample.outputs.write_normals", interrupt)
-        assert of(pair, out, *BICUBIC, "--only", "depth,normals") == 130
+        assert of(pair, out, *BICUBIC, "--only", "depth,normals", "--overwrite") == 130
     assert "the same command continues from there" in capsys.readouterr().err
     assert info(out)["complete"] is False
     assert of(pair, out, *BICUBIC, "--only", "depth,normals") == 0
     assert info(out)["complete"] is True
+    assert files_in(out) == {"depth.png", "depth_metres.tiff", "normals.png", "info.json"}
 
 
 def test_result_overwrites_neither_its_input_nor_foreign_files(pair, tmp_path, capsys):
@@ -374,25 +368,6 @@ def test_pictures_that_do_not_fit_each_other_are_refused_in_one_line(pair, tmp_p
     assert "photo.heic: " in refused_line(capsys, of((tmp_path / "photo.heic", depth), tmp_path / "out", *DEPTH_ONLY))
     assert "--rgb: " in refused_line(capsys, of((tmp_path / "none.jpg", depth), tmp_path / "out", *DEPTH_ONLY))
     assert not (tmp_path / "out").exists()
-
-
-def test_noise_is_estimated_and_may_be_given(cube, tmp_path, capsys):
-    coarse = cube.depth.reshape(16, 4, 16, 4).mean((1, 3))
-    noise = np.random.default_rng(0).normal(size=coarse.shape)
-    np.save(tmp_path / "noisy.npy", coarse * (1 + 0.01 * noise))
-    Image.fromarray(cube.rgb).save(tmp_path / "photo.png")
-    given = (tmp_path / "photo.png", tmp_path / "noisy.npy")
-    results, said = [], []
-    for options in ((), ("--noise", "0.05"), ("--smooth", "0")):
-        out = tmp_path / str(len(results))
-        assert of(given, out, "--only", "depth", *options) == 0
-        said.append(capsys.readouterr().out)
-        results.append(read_depth_file(out / "depth_metres.tiff"))
-    assert ["noise of the depth map (about " in each for each in said] == [True, False, True]
-    estimate = float(said[0].split("noise of the depth map (about ")[1].split(" mm")[0])
-    assert 0.2 * 10 * np.median(coarse) < estimate < 5 * 10 * np.median(coarse)
-    assert info(tmp_path / "1")["settings"]["set"] == {"noise": 0.05}
-    assert not any(np.array_equal(results[0], other) for other in results[1:])
 
 
 def test_what_is_likely_to_be_wrong_is_left_out_of_the_mesh(pair, tmp_path, capsys):

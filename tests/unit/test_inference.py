@@ -11,8 +11,9 @@ from torch import Tensor
 import dsr
 from dsr.geometry.camera import Camera
 from dsr.geometry.resampling import resize_inverse_depth
-from dsr.inference import Plan, find_filled, plan_for, upsample_surface
-from dsr.inference.resizing import resize_nearest
+from dsr.inference import upsample_surface
+from dsr.inference.plausibility import find_filled
+from dsr.inference.resizing import Plan, plan_for, resize_nearest
 from dsr.inference.working_size import enlarged_by
 from dsr.methods.recipe import read_recipe
 
@@ -133,6 +134,13 @@ def test_plan_describes_the_steps() -> None:
     assert plan((480, 640), (160, 213), method="bicubic").scale == 3  # 3.005
     assert plan((480, 640), (152, 203), method="bicubic").scale == 4  # 3.16
     assert plan((480, 640), (160, 214), method="bicubic").steps == ()
+    for photo, depth, factor in (
+        ((968, 1296), (480, 640), 2), ((964, 1286), (240, 320), 4), ((1440, 1920), (192, 256), 8),
+        ((480, 640), (480, 640), 1),
+    ):  # fmt: skip
+        assert plan(photo, depth).scale == factor
+        weights = read_recipe("facets").weights(max(photo[1] / depth[1], 1))
+        assert weights.name == f"facets_x{max(factor, 2)}.safetensors"
     text = plan((3000, 4000), (750, 1000)).text
     assert "750 x 1000 depth to 3000 x 4000 by facets x4" in text
     assert text.count("\n") == 0
@@ -167,26 +175,15 @@ def test_depth_that_is_no_distance_is_refused(value: float) -> None:
         upsample_depth(_photo(48, 64), depth, _camera(48, 64))
 
 
-def test_result_without_any_depth_is_refused_rather_than_filled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "dsr.methods.classical.interpolation.Interpolation.interpolate",
-        lambda _, depth, lr, hr: torch.full((1, hr.height, hr.width), math.nan),
-    )
-    camera = _camera(48, 64)
-    with pytest.raises(ValueError, match=r"^bicubic gave no finite positive depth in any of the 3072 pixels$"):
-        upsample_depth(_photo(48, 64), _plane(12, 16, camera), camera, method="bicubic")
-
-
-def test_pixel_that_a_method_has_no_depth_for_stays_a_hole(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interpolate(_: object, depth: Tensor, lr: Camera, hr: Camera) -> Tensor:
-        result = torch.full((1, hr.height, hr.width), 2.0)
-        result[0, 3, 5] = math.nan
-        return result
-
-    monkeypatch.setattr("dsr.methods.classical.interpolation.Interpolation.interpolate", interpolate)
-    camera = _camera(48, 64)
+def test_pixels_without_depth_stay_holes_and_a_result_without_any_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    result, camera = torch.full((1, 48, 64), 2.0), _camera(48, 64)
+    result[0, 3, 5] = math.nan
+    monkeypatch.setattr("dsr.methods.classical.interpolation.Interpolation.interpolate", lambda *_: result.clone())
     fine = upsample_depth(_photo(48, 64), _plane(12, 16, camera), camera, method="bicubic")
     assert fine.isnan().nonzero().tolist() == [[0, 3, 5]]
+    result[:] = math.nan
+    with pytest.raises(ValueError, match=r"^bicubic gave no finite positive depth in any of the 3072 pixels$"):
+        upsample_depth(_photo(48, 64), _plane(12, 16, camera), camera, method="bicubic")
 
 
 @pytest.mark.parametrize("method", AT_HAND)
@@ -231,20 +228,6 @@ def test_settings_change_the_result_and_are_checked() -> None:
     ):
         with pytest.raises(ValueError, match=f"^{message}"):
             dsr.upsample(_photo(32, 32), depth, camera, method="tgv", **settings)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("photo", "depth", "factor"),
-    [
-        ((968, 1296), (480, 640), 2),
-        ((964, 1286), (240, 320), 4),
-        ((1440, 1920), (192, 256), 8),
-        ((480, 640), (480, 640), 1),
-    ],
-)
-def test_ratios_next_to_a_factor_take_its_weights(photo: tuple[int, int], depth: tuple[int, int], factor: int) -> None:
-    assert plan(photo, depth).scale == factor
-    assert read_recipe("facets").weights(max(photo[1] / depth[1], 1)).name == f"facets_x{max(factor, 2)}.safetensors"
 
 
 def test_pixels_that_a_method_leaves_out_stay_holes() -> None:

@@ -65,23 +65,18 @@ DEPTHS: dict[str, Any] = {
     "uint16": (millimetres, "mm"),
     "int32": (lambda: millimetres().astype(np.int32), 1e-3),
     "big-endian": (lambda: millimetres().astype(">u2"), "1/1000"),
-    "PIL": (lambda: Image.fromarray(millimetres()), "mm"),
+    "depth of PIL": (lambda: Image.fromarray(millimetres()), "mm"),
     "floats of millimetres": (lambda: millimetres().astype(np.float64), "mm"),
-    "flipped": (lambda: metres()[::-1].copy()[::-1], None),
+    "flipped depth": (lambda: metres()[::-1].copy()[::-1], None),
     "with an axis in front": (lambda: metres()[None], None),
     "float64": (lambda: metres().astype(np.float64), "m"),
 }
 
 
-@pytest.mark.parametrize("kind", PHOTOS)
-def test_photo_is_taken_in_any_form(kind: str, expected: np.ndarray) -> None:
-    np.testing.assert_array_equal(dsr.upsample(PHOTOS[kind](), metres(), CAMERA, method=QUICK), expected)
-
-
-@pytest.mark.parametrize("kind", DEPTHS)
-def test_depth_is_taken_in_any_form(kind: str, expected: np.ndarray) -> None:
-    make, unit = DEPTHS[kind]
-    found = dsr.upsample(photo(), make(), CAMERA, unit=unit, method=QUICK)
+@pytest.mark.parametrize("kind", [*PHOTOS, *DEPTHS])
+def test_photo_and_depth_are_taken_in_any_form(kind: str, expected: np.ndarray) -> None:
+    make, unit = DEPTHS.get(kind, (metres, None))
+    found = dsr.upsample(PHOTOS.get(kind, photo)(), make(), CAMERA, unit=unit, method=QUICK)
     assert (type(found), found.dtype) == (np.ndarray, np.float32)
     np.testing.assert_array_equal(found, expected)
 

@@ -1,6 +1,5 @@
 """Methods of fixed factors at other scales: what ``dsr.upsample`` gives, and a note."""
 
-import itertools
 from typing import Any
 
 import pytest
@@ -10,7 +9,8 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.inference import AnyRatio, Selection, upsample_surface, upsampler
+from dsr.inference import upsample_surface, upsampler
+from dsr.inference.any_ratio import AnyRatio, Selection
 from dsr.methods.base import Method, Surface
 from dsr.methods.recipe import Recipe, Run, read_recipe
 from dsr.sample import DepthSample
@@ -43,32 +43,9 @@ def test_methods_take_the_scales_that_they_are_made_for(name: str, scales: tuple
     assert tuple(scale for scale in (1, 1.5, 2, 3) if abilities.takes(scale)) == scales
 
 
-SETTINGS: dict[str, Any] = {"tgv": {"iterations": 50}}
-
-
-ANY_RATIO = ("nearest", "bilinear", "bicubic", "guided_filter", "joint_bilateral", "fast_global_smoother", "bilateral")
-
-
-@pytest.mark.parametrize(
-    ("name", "size"),
-    [
-        *itertools.product(ANY_RATIO, [(48, 36), (18, 13), (16, 12)]),
-        ("tgv", (48, 36)),
-        ("tgv", (16, 12)),
-    ],
-)
-def test_methods_reproduce_a_wall_at_any_ratio_that_they_take(name: str, size: tuple[int, int]) -> None:
-    sample = _sample(*size)
-    wall = torch.full_like(sample.depth_lr, 2.0)
-    sample = DepthSample("set", "hall", sample.rgb, wall, CAMERA, sample.camera_lr, sample.scale)
-    depth = read_recipe(name, SETTINGS.get(name)).build(4)(sample)
-    assert tuple(depth.shape) == (1, 36, 48)
-    torch.testing.assert_close(depth, torch.full_like(depth, 2.0), rtol=0.05, atol=0)
-
-
 def test_method_that_reproduces_block_means_only_fills_holes_at_a_scale_of_1() -> None:
     sample = _sample(48, 36, hole=True)
-    depth = read_recipe("tgv", SETTINGS["tgv"]).build(4)(sample)
+    depth = read_recipe("tgv", {"iterations": 50}).build(4)(sample)
     valid = sample.mask_lr
     torch.testing.assert_close(depth[valid], sample.depth_lr[valid], rtol=1e-5, atol=0)
     assert bool(depth.isfinite().all())

@@ -43,7 +43,7 @@ def views(count=5, deviation=0.01):
     return [View(noisy(room(own), seed, deviation), CAMERA, own) for seed, own in enumerate(poses)]
 
 
-def test_five_frames_have_less_than_half_the_noise_and_their_deviation_says_so():
+def test_five_frames_have_less_than_half_the_noise():
     first, *others = views()
     fused = fuse_views(first, others)
     truth = room(first.pose)
@@ -53,7 +53,6 @@ def test_five_frames_have_less_than_half_the_noise_and_their_deviation_says_so()
     assert bool((fused.others <= fused.seeing).all())
     before, after = ((each - truth)[inner].std() for each in (first.depth, fused.depth))
     assert float(after) < 0.45 * float(before)
-    assert float(fused.deviation[inner].mean()) == pytest.approx(float(after), rel=0.5)
     assert float((fused.depth - truth)[inner].mean().abs()) < 0.005
 
 
@@ -100,15 +99,6 @@ def test_holes_are_filled_by_what_others_see_and_stay_without():
     assert float((filled.depth - room(first.pose))[:, 32:38, 44:56].abs().max()) < 0.05
     empty = fuse_views(View(depth, CAMERA, first.pose), blind)
     assert torch.equal(empty.depth.isnan(), depth.isnan())
-
-
-def test_frames_count_by_their_expected_errors():
-    first = views()[0]
-    flat = torch.ones_like(first.depth)
-    near, far = 2.0 * flat, 2.02 * flat
-    sure = View(near, CAMERA, pose(), 0.01 * flat)
-    fused = fuse_views(sure, [View(far, CAMERA, pose(), 0.1 * flat)])
-    assert float(fused.depth.mean()) == pytest.approx(2.0002, abs=0.0003)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from dsr.data.rendered import Procedural
 from dsr.geometry.camera import Camera
-from dsr.inference import Selection, select, upsample_surface
+from dsr.inference import upsample_surface
+from dsr.inference.any_ratio import Selection, select
 from dsr.inference.working_size import find_noise, limit_to_noise, mix_where_calm, reduce_by_medians, working_size_of
 from dsr.methods.base import InverseSurface, MapNoise
 from dsr.methods.recipe import Run, read_recipe

@@ -29,7 +29,7 @@ from omegaconf import OmegaConf
 from rich.console import Console
 
 from dsr.app.requests import BrowserRequest
-from dsr.inference.defaults import DEFAULT
+from dsr.inference import DEFAULT
 from dsr.io.depth_files import READ_SUFFIXES
 from dsr.io.layouts import CAPTURE_FILES
 from dsr.io.pairs import PHOTO_SUFFIXES

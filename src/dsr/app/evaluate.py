@@ -50,7 +50,7 @@ from dsr.evaluation.scenes import (
     headline_means,
     write_tables,
 )
-from dsr.inference.selection import Selection, select
+from dsr.inference.any_ratio import Selection, select
 from dsr.methods.base import WORKSPACE, Method
 from dsr.methods.networks.weight_files import files_of_weights
 from dsr.methods.recipe import Known, Recipe, Run

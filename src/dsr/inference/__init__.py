@@ -1,47 +1,23 @@
 """Upsample the depth map of a photo: any size, any ratio of the sizes, maps with holes, bounded memory."""
 
-from __future__ import annotations
-
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
-from dsr.inference.defaults import DEFAULT, WIDEST, Fill
-
-if TYPE_CHECKING:
-    from dsr.inference.any_ratio import AnyRatio, upsample_surface, upsampler
-    from dsr.inference.plans import Plan, plan_for
-    from dsr.inference.plausibility import find_filled
-    from dsr.inference.selection import Selection, select
-    from dsr.inference.working_size import enlarged_by, find_sensor
-
-__all__ = [
-    "DEFAULT",
-    "WIDEST",
-    "AnyRatio",
-    "Fill",
-    "Plan",
-    "Selection",
-    "enlarged_by",
-    "find_filled",
-    "find_sensor",
-    "plan_for",
-    "select",
-    "upsample_surface",
-    "upsampler",
-]
-
-_NAMES = {
-    "any_ratio": ("AnyRatio", "upsample_surface", "upsampler"),
-    "plans": ("Plan", "plan_for"),
-    "plausibility": ("find_filled",),
-    "selection": ("Selection", "select"),
-    "working_size": ("enlarged_by", "find_sensor"),
+DEFAULT = "facets"  # the method where none is chosen
+Fill = Literal["all", "small", "none"]  # which holes are filled
+# Degrees of view of the widest hole that counts as small. On Middlebury 2014 and ICL-NUIM with holes cut into them,
+# depth that ``facets`` fills in is off by 1.2 % on average at 0.2 to 0.4 degrees from a measured pixel, by 3 % at 0.7
+# to 1 degree, and by 6 % and more beyond; half of these pixels are off by more than 2 %.
+WIDEST = 2.0
+_MODULES = {
+    "find_sensor": "working_size",
+    "upsample_surface": "any_ratio",
+    "upsampler": "any_ratio",
 }
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is asked for: the options alone load nothing heavy."""
-    for module, names in _NAMES.items():
-        if name in names:
-            return getattr(importlib.import_module(f"{__name__}.{module}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    """Import a function when it is asked for: the choices above load nothing heavy."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, get_args
@@ -17,13 +17,25 @@ from dsr.degradation.sensors import Identified
 from dsr.geometry.camera import Camera
 from dsr.geometry.hole_size import degrees_per_pixel, wide_holes
 from dsr.geometry.resampling import pad_inverse_depth
-from dsr.inference.defaults import DEFAULT, SIZES, USUAL_SCALE, WIDEST, Fill
-from dsr.inference.plans import OWN_SIZE, Plan, plan_for, steps_of
+from dsr.inference import DEFAULT, WIDEST, Fill
 from dsr.inference.plausibility import count_patches, expect_errors, find_outliers, within_measured
-from dsr.inference.resizing import at_factors, at_ratio, padded, resize_nearest, size_of
+from dsr.inference.resizing import (
+    OWN_SIZE,
+    USUAL_SCALE,
+    Plan,
+    at_factors,
+    at_ratio,
+    cropped,
+    padded,
+    plan_for,
+    resize_nearest,
+    size_of,
+    steps_of,
+)
 from dsr.inference.rims import Settled, settle_holes
 from dsr.inference.working_size import (
     CORRELATED,
+    SIZES,
     enlarged_by,
     find_noise,
     find_sensor,
@@ -36,6 +48,7 @@ from dsr.inference.working_size import (
 )
 from dsr.methods.base import InverseSurface, MapNoise, Method, NoiseLaw, Surface, expect_some_depth
 from dsr.methods.glass import NOTED, expect_glass
+from dsr.methods.networks.weight_files import has_weights
 from dsr.methods.recipe import Recipe, Run, read_recipe
 from dsr.sample import DepthSample, expect_distances
 from dsr.utils.compute_device import fast_precision, pick_device
@@ -52,24 +65,15 @@ class AnyRatio(Method):
     """A method of any factors as one of any ratio, whose maps may have the photo's size, holes and errors.
 
     The method is built once for each factor, so that many maps load its weights once. A low-resolution map is
-    upsampled as :mod:`dsr.inference.plans` describes. Methods that take a map of the photo's size take it as it is,
+    upsampled as :mod:`dsr.inference.resizing` describes. Methods that take a map of the photo's size take it as it is,
     unless a scale is given; for other methods it is first downsampled by ``scale``, by averaging the inverse depth of
-    its valid pixels; if it was enlarged by repeating pixels, the repeated ones are dropped instead. The averages may
-    cross depth steps, as in the networks' training.
-    Patches that are far from everything around them are treated as holes, and the result stays within what is measured
-    around each pixel, see :mod:`dsr.inference.plausibility`.
-    (With a tenth of the map missing, RMSE_v on Lucy is 0.127, against 0.142 or more with means, medians or planes of
-    one surface.)
+    its valid pixels, even across depth steps, as in the networks' training; if it was enlarged by repeating pixels, the
+    repeated ones are dropped instead. (With a tenth of the map missing, RMSE_v on Lucy is 0.127, against 0.142 or more
+    with means, medians or planes of one surface.)
 
-    Args:
-        recipe: the method.
-        device: where to compute.
-        scale, fill, max_hole, working_size: see :class:`dsr.Upsampler`. Holes are pixels whose own depth, or whose
-            nearest low-resolution pixel, is missing. Without a working size ``facets`` chooses it, see
-            :mod:`dsr.inference.working_size`.
-        precision: dtype of the convolutions; None for the device's fast one where that costs no accuracy.
-        seed: of random numbers.
-
+    For the options see :class:`dsr.Upsampler`; holes are pixels whose own depth, or whose nearest low-resolution pixel,
+    is missing. ``precision`` is the dtype of the convolutions; None for the device's fast one where that costs no
+    accuracy.
     """
 
     def __init__(
@@ -102,7 +106,8 @@ class AnyRatio(Method):
 
     def first(self) -> Method:
         """Return the method for its smallest factor, which checks the settings."""
-        return self._method(min((step for steps in self._steps.values() for step in steps), default=USUAL_SCALE))
+        factors = [step for steps in steps_of(self.recipe).values() for step in steps]
+        return self._method(min(factors, default=USUAL_SCALE))
 
     def check_working_size(self) -> None:
         """Check that a working size other than the map's own has an effect with this method and scale."""
@@ -144,23 +149,18 @@ class AnyRatio(Method):
         *,
         estimate_errors: bool = True,
     ) -> Surface:
-        """Upsample a depth map to the photo's size, with the expected errors.
+        """Upsample a depth map, (1, h, w) in metres with NaN in holes, to the size of a photo, (3, H, W) in [0, 1].
 
-        ``facets`` says them; for other methods they are estimated, see :mod:`dsr.inference.plausibility`. The depth map
-        is registered to the photo: the same view and field of view, outer edge on outer edge.
+        Both are registered: the same view and field of view, outer edge on outer edge. ``facets`` states the expected
+        errors; for other methods they are estimated, see :mod:`dsr.inference.plausibility`, unless not
+        ``estimate_errors``.
 
         Args:
-            rgb: (3, H, W) floating point, in [0, 1].
-            depth: (1, h, w) orthogonal depth in metres, NaN in holes.
             camera: the photo's; only interpolation and deep image priors depend on it.
-            progress: is called with the number of parts done and their total.
             sensor: what measured the map: of :func:`~dsr.inference.find_sensor`, or its argument; None for none. No
-                expected error is less than what remains of the least noise that the sensor is known to have; a
-                systematic error of which its maker states a limit is added to it, as independent errors add. Where it
-                counts disparity, and the noise of the map is correlated over 5 pixels or more, ``facets`` without a
-                scale is given how strong the noise is and that it grows with the square of the distance, unless
-                ``noise`` is set.
-            estimate_errors: whether there are expected errors for a method that states none.
+                expected error is less than what remains of the sensor's least noise, and a systematic error of which
+                its maker states a limit is added. If it counts disparity, see also
+                :func:`~dsr.inference.working_size.known_noise`.
 
         Returns:
             Depth, (1, H, W) float32 in metres, its expected errors, and which depth is filled in, on the device of
@@ -174,24 +174,24 @@ class AnyRatio(Method):
         given, outliers = _invert(depth)
         inverse, factor, scale = self._at_own_size(given, size_of(rgb), planned)
         valid = (given if size_of(inverse) == size_of(rgb) else inverse).isfinite()  # but for repeated pixels
-        settled, doubt = settle_holes(inverse, rgb, self._small_holes(inverse.isfinite(), camera))
+        settled = settle_holes(inverse, rgb, self._small_holes(inverse.isfinite(), camera))
         if factor > 1:
-            inverse_lr = Downsampling("box")(pad_inverse_depth(settled, factor), factor)
-            found = padded(
-                lambda photo, view: self._upsample(photo, inverse_lr, view, factor, progress),
-                factor, rgb, inverse_lr, camera,
-            )  # fmt: skip
+            inverse_lr = Downsampling("box")(pad_inverse_depth(settled.inverse, factor), factor)
+            whole, view = padded(rgb, camera, factor, size_of(inverse_lr))
+            found = cropped(self._upsample(whole, inverse_lr, view, factor, progress), camera)
         elif self._may_reduce:
-            found = self._at_working_size(rgb, inverse, settled, camera, sensor, progress)
+            found = self._at_working_size(rgb, inverse, settled.inverse, camera, sensor, progress)
         else:
-            found = self._upsample(rgb, settled, camera, scale, progress)
+            found = self._upsample(rgb, settled.inverse, camera, scale, progress)
         expect_some_depth(found.inverse, self.recipe.name)  # as good as of the depth: 0 and infinity change places
         photo = None if is_told_clean(self.recipe) else rgb.to(found.inverse.device)
-        surface = _in_depth(found, inverse, Settled(settled, doubt), photo, camera, sensor, estimate=estimate_errors)
-        surface = surface._replace(outliers=count_patches(outliers))
-        surface = self._restore_holes(surface, valid, camera)
+        surface = _in_depth(found, inverse, settled, photo, camera, sensor, estimate=estimate_errors)
+        if self._fill != "all" and not bool(valid.all()):
+            left = ~valid if self._fill == "none" else ~valid & ~self._small_holes(valid, camera)
+            holes = resize_nearest(left, size_of(rgb)).to(surface.depth.device)
+            surface = surface.map(lambda values: values.masked_fill(holes, torch.nan))
         missing = resize_nearest(~valid, size_of(rgb)).to(surface.depth.device)
-        surface = surface._replace(filled=missing & surface.depth.isfinite())
+        surface = surface._replace(outliers=count_patches(outliers), filled=missing & surface.depth.isfinite())
         return surface.map(lambda values: values.to(depth.device))
 
     def _at_own_size(self, inverse: Tensor, size: tuple[int, int], planned: Plan) -> tuple[Tensor, int, int | None]:
@@ -225,16 +225,11 @@ class AnyRatio(Method):
         else:
             inverse_lr = reduce_by_medians(pad_inverse_depth(inverse, factor), factor)
             ratio = factor * camera.width / inverse.shape[-1]
-            found = padded(
-                lambda photo, view: self._upsample(photo, inverse_lr, view, None, progress, known),
-                ratio, rgb, inverse_lr, camera,
-            )  # fmt: skip
+            photo, view = padded(rgb, camera, ratio, size_of(inverse_lr))
+            found = cropped(self._upsample(photo, inverse_lr, view, None, progress, known), camera)
             if ratio > USUAL_SCALE:  # weights for larger ratios leave more waves on calm surfaces
-                smoother = padded(
-                    lambda photo, view: at_ratio(self._method(USUAL_SCALE), photo, inverse_lr, view, None, known),
-                    ratio, rgb, inverse_lr, camera,
-                )  # fmt: skip
-                found = mix_where_calm(found, smoother, measured, reach=round(ratio / 4))
+                smoother = at_ratio(self._method(USUAL_SCALE), photo, inverse_lr, view, None, known)
+                found = mix_where_calm(found, cropped(smoother, camera), measured, reach=round(ratio / 4))
             # what the network has found is of the smaller map
             found = found._replace(noise=noise and noise._replace(reduced=factor))
         if noise is None or found.spread is None or (factor == 1 and noise.extent < CORRELATED):
@@ -277,23 +272,10 @@ class AnyRatio(Method):
         """Whether the working size may be smaller than the map's."""
         return self._scale is None and finds_noise(self.recipe)
 
-    @functools.cached_property
-    def _steps(self) -> Mapping[int, tuple[int, ...]]:
-        """The factors of the calls that give each factor; none for a method of any ratio."""
-        return steps_of(self.recipe)
-
     def _small_holes(self, valid: Tensor, camera: Camera) -> Tensor:
         """Return the small holes of a map, (1, h, w), be they to be filled or not: what is beside depends on it."""
         focal = camera.fx * valid.shape[-1] / camera.width
         return ~valid & ~wide_holes(valid, self._max_hole / degrees_per_pixel(focal))
-
-    def _restore_holes(self, surface: Surface, valid: Tensor, camera: Camera) -> Surface:
-        """Return a surface without the holes of the map, (1, h, w), that are not to be filled."""
-        if self._fill == "all" or bool(valid.all()):
-            return surface
-        left = ~valid if self._fill == "none" else ~valid & ~self._small_holes(valid, camera)
-        holes = resize_nearest(left, size_of(surface.depth)).to(surface.depth.device)
-        return surface.map(lambda values: values.masked_fill(holes, torch.nan))
 
 
 def finds_noise(recipe: Recipe) -> bool:
@@ -323,11 +305,7 @@ def upsampler(
 ) -> AnyRatio:
     """Return a method of ``conf/method`` for depth maps of any size, which loads its weights once.
 
-    Args:
-        method: the name of one in ``conf/method``.
-        scale: see :class:`AnyRatio`, also for ``fill``, ``max_hole`` and ``working_size``.
-        settings: arguments of the method that differ from its file, by name.
-        device: ``auto`` for a GPU if there is one, or a device as torch names it.
+    ``settings`` are arguments of the method that differ from its file; for the others see :class:`dsr.Upsampler`.
 
     Example:
         >>> import torch
@@ -354,6 +332,54 @@ def upsample_surface(
 ) -> Surface:
     """Upsample one depth map: :meth:`AnyRatio.upsample` with the options of :func:`upsampler`."""
     return upsampler(scale=scale, **options).upsample(rgb, depth, camera, progress, sensor)
+
+
+@dataclass(frozen=True)
+class Selection:
+    """A method for one scale, as an evaluation runs it."""
+
+    recipe: Recipe  # with its weights
+    scale: float  # ratio of the photo's width to the depth map's
+    direct: bool  # run at this scale itself; else as in ``dsr upsample``, which may resize photo and map
+
+    def files(self) -> list[Path]:
+        """Return the files of weights that it may use; a ConfigError if one is missing."""
+        factors: set[float] = {self.scale}
+        if not self.direct:
+            steps = steps_of(self.recipe).values()
+            factors = {step for each in steps for step in each} or set(self.recipe.computed_at)
+        found = (self.recipe.weights(factor) for factor in sorted(factors))
+        return list(dict.fromkeys(file for file in found if file is not None))
+
+    def build(self, run: Run) -> Method:
+        """Build the method; a ConfigError if it rejects a setting, or has no weights."""
+        if self.direct:
+            return self.recipe.build(self.scale, run)
+        try:
+            fill: Fill = "none" if self.recipe.at().get("fill_holes") is False else "all"
+            method = AnyRatio(self.recipe, torch.device(run.device), fill=fill, precision=run.precision, seed=run.seed)
+            method.first()
+        except ConfigError:
+            raise
+        except ValueError as error:
+            raise ConfigError(str(error.__cause__ or error)) from error  # with the key as the run names it
+        return method
+
+
+def select(recipe: Recipe, scale: float, weights: Path | None = None, *, measured: bool = False) -> Selection:
+    """Select how an evaluation runs a method at a scale, the ratio of the photo's width to the depth map's.
+
+    ``weights`` are a file of weights, or a directory with published ones; None for those that the method names. With
+    ``measured`` maps, a sensor's own, a method that can choose its working size by the map's noise does so; of one
+    without packaged weights for their ratio, those for another one are taken. Of a model of downsampling, the error
+    says that it needs weights.
+    """
+    node = recipe.at().get("weights")  # with the scale as the run names it
+    packaged = node.get("packaged") if isinstance(node, Mapping) else None
+    lacking = weights is None and packaged is not None and not has_weights(node, scale)
+    as_upsample = measured and (lacking or finds_noise(recipe))
+    direct = recipe.abilities.takes(scale) and not as_upsample
+    return Selection(recipe.with_weights(weights), scale, direct)
 
 
 def _invert(depth: Tensor) -> tuple[Tensor, Tensor]:

@@ -33,22 +33,16 @@ _PASSES = 2  # passes of the robust mean
 
 @dataclass(frozen=True)
 class View:
-    """A depth map with its camera's place.
-
-    Without a deviation, one number for the inverse depth of all views is estimated.
-    """
+    """A depth map with its camera's place."""
 
     depth: Tensor  # (1, h, w) orthogonal depth in metres, NaN in holes
     camera: Camera
     pose: Matrix  # from the camera's frame (x right, y down, z forward) to the world's, 4 x 4, metres
-    deviation: Tensor | None = None  # (1, h, w) expected standard deviation of each pixel in metres
 
     def __post_init__(self) -> None:
         shape = (1, self.camera.height, self.camera.width)
         if tuple(self.depth.shape) != shape:
             raise ValueError(f"depth: expected shape {shape}, the camera's, got {tuple(self.depth.shape)}")
-        if self.deviation is not None and self.deviation.shape != self.depth.shape:
-            raise ValueError(f"deviation: expected shape {shape}, got {tuple(self.deviation.shape)}")
         object.__setattr__(self, "pose", as_rigid(self.pose, "pose"))
 
     @functools.cached_property
@@ -63,7 +57,6 @@ class Fused(NamedTuple):
     """Depth on which frames voted, (1, h, w) each."""
 
     depth: Tensor  # in metres, NaN in holes
-    deviation: Tensor  # its expected standard deviation in metres, if the frames' noise is independent
     votes: Tensor  # the number of frames that agree
     others: Tensor  # the number of neighbours that agree
     seeing: Tensor  # the number of neighbours that see something there
@@ -83,9 +76,10 @@ def fuse_views(reference: View, neighbours: Sequence[View]) -> Fused:
         True
 
     """
-    estimated = [view.noise for view in (reference, *neighbours) if view.deviation is None]
-    noise = float(np.median(estimated)) if estimated else 0.0  # they are of one sensor
-    readings = [_own(reference, noise), *(_seen_from(reference, view, noise) for view in neighbours)]
+    noise = float(np.median([view.noise for view in (reference, *neighbours)]))  # they are of one sensor
+    own = reference.depth[0].double().reciprocal()
+    readings = [(own, torch.full_like(own, _deviation(own, noise)))]
+    readings += [_seen_from(reference, view, noise) for view in neighbours]
     inverse, deviation = (torch.stack(each) for each in zip(*readings, strict=True))  # (N + 1, h, w)
     centre = _most_voted(inverse, deviation)
     for _ in range(_PASSES):
@@ -93,39 +87,29 @@ def fuse_views(reference: View, neighbours: Sequence[View]) -> Fused:
         total = weight.sum(0)
         mean = (weight * inverse.nan_to_num(0)).sum(0) / total
         centre = torch.where(total > 0, mean, centre)
-    weight = _weights(inverse, deviation, centre)
-    agreeing = weight > 0
+    agreeing = _weights(inverse, deviation, centre) > 0
     counts = agreeing.sum(0), agreeing[1:].sum(0), inverse[1:].isfinite().sum(0)
-    spread = weight.sum(0).rsqrt() / centre.square()
-    depth = centre.reciprocal()
-    spread = spread.masked_fill(depth.isnan(), torch.nan)
-    return Fused(*(each[None].to(reference.depth) for each in (depth, spread, *counts)))
+    return Fused(*(each[None].to(reference.depth) for each in (centre.reciprocal(), *counts)))
 
 
-def _own(view: View, noise: float) -> tuple[Tensor, Tensor]:
-    """Return a view's inverse depth and the standard deviation of it, (h, w) float64 each."""
-    inverse = view.depth[0].double().reciprocal()
-    inverse = inverse.masked_fill(~inverse.isfinite(), torch.nan)
-    least = _LEAST_NOISE * float(inverse.nanmedian().nan_to_num(1.0))
-    if view.deviation is None:
-        return inverse, torch.full_like(inverse, max(noise, least))
-    return inverse, (view.deviation[0].double() * inverse.square()).clamp(min=least)
+def _deviation(inverse: Tensor, noise: float) -> float:
+    """Return the standard deviation of a map of inverse depth, NaN in holes, whose estimated noise may be none."""
+    return max(noise, _LEAST_NOISE * float(inverse.nanmedian().nan_to_num(1.0)))
 
 
 def _seen_from(reference: View, view: View, noise: float) -> tuple[Tensor, Tensor]:
     """Return another view's inverse depth and its standard deviation as the reference sees it, (h, w) each."""
     move = torch.from_numpy(relative(view.pose, reference.pose))[None]
-    depth = warp_depth(view.depth[None].double().cpu(), view.camera, move, reference.camera)
-    _, deviation = _own(view, noise)
+    own = view.depth[0].double().cpu()
+    depth = warp_depth(own[None, None], view.camera, move, reference.camera)
     u, v = source_pixels(depth, view.camera, move, reference.camera)
     rows = v[0].nan_to_num(0).round().long().clamp(0, view.camera.height - 1)
     columns = u[0].nan_to_num(0).round().long().clamp(0, view.camera.width - 1)
-    before = view.depth[0].double().cpu()[rows, columns]  # inverse depth's deviation scales with its square
     seen = depth[0, 0].reciprocal()
-    ratio = (seen * before).square().nan_to_num(1.0)
-    found = deviation.cpu()[rows, columns] * ratio
+    ratio = (seen * own[rows, columns]).square().nan_to_num(1.0)  # inverse depth's deviation scales with its square
+    deviation = _deviation(own.reciprocal(), noise) * ratio
     device = reference.depth.device
-    return seen.to(device), torch.where(found.isfinite(), found, torch.inf).to(device)
+    return seen.to(device), torch.where(deviation.isfinite(), deviation, torch.inf).to(device)
 
 
 def _tolerance(inverse: Tensor, deviation: Tensor, centre: Tensor, own: Tensor | float) -> Tensor:

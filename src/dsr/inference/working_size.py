@@ -20,11 +20,11 @@ from torch.nn import functional
 
 from dsr.degradation.sensors import Identified, identify
 from dsr.geometry.hole_size import window_maxima
-from dsr.inference.defaults import SIZES
 from dsr.inference.resizing import resize_nearest, size_of
 from dsr.methods.base import InverseSurface, MapNoise, NoiseLaw
 
 T = TypeVar("T", float, Tensor)
+SIZES = (1, 2, 4, 8, 16)  # by what the size of a sensor's map may be divided before it is worked on
 _LARGEST_BLOCK = 16
 _NOISY = 0.4  # standard deviation of a sensor's disparity in its steps, at least; rounding alone has 0.29
 CORRELATED = 5.0  # pixels over which noise is correlated that a network takes for shape in part

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar, cast
 
@@ -12,17 +13,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.app.upsample.arrays import Given, doubts_of, is_batch, picture_of, pictures_of
+from dsr.app.upsample.arrays import picture_of, pictures_of
 from dsr.app.upsample.checks import align
-from dsr.app.upsample.frame import prepare, without_repeats
+from dsr.app.upsample.frames import nearest, prepare, view_of, vote, without_repeats
 from dsr.app.upsample.outputs import as_stored
-from dsr.app.upsample.sequence import camera_lr, nearest, vote
 from dsr.app.upsample.surface import Array, Surface
-from dsr.degradation.sensors import Identified
 from dsr.geometry.camera import Camera
-from dsr.inference import upsampler
-from dsr.inference.defaults import DEFAULT, WIDEST, Fill
+from dsr.inference import DEFAULT, WIDEST, Fill
+from dsr.inference.any_ratio import upsampler
+from dsr.inference.resizing import size_of
 from dsr.inference.sequences import View
+from dsr.io.cameras import doubt_camera, doubt_depth
 from dsr.io.files import python_messages
 from dsr.io.inputs import Picture
 from dsr.methods import base
@@ -96,7 +97,8 @@ def upsample(
 
     """
     run, given = Upsampler(scale=scale, **how), cast("Any", depth)
-    if not is_batch(rgb, given):
+    several = isinstance(rgb, list | tuple) or isinstance(given, list | tuple) or getattr(rgb, "ndim", 0) == 4
+    if not several:
         return cast("Maps", run(rgb, given, cast("Camera", camera), mask=mask, unit=unit, progress=progress).depth)
     found = []
     for number, each in enumerate(pictures_of(rgb, given, camera, mask)):
@@ -185,9 +187,8 @@ class Upsampler:
 
         """
         with python_messages():
-            given = picture_of(rgb, depth, camera, mask=mask, unit=unit)
-            picture, identified = prepare(without_repeats(given.picture), self._sensor, lambda each: each)
-            return self._finish(picture, identified, given, progress, look=True)
+            picture = without_repeats(picture_of(rgb, depth, camera, mask=mask, unit=unit))
+            return self._upsample(picture, _device_of(depth), progress=progress)
 
     def stream(
         self, frames: Iterable[tuple[Any, ...]], *, neighbours: int = 4, unit: str | float | None = None
@@ -229,16 +230,20 @@ class Upsampler:
 
         A frame may be read ahead, for those before it; what is wrong with it is an error when its own turn comes.
         """
-        source, place = iter(frames), 0
-        kept: dict[int, Given | ValueError] = {}
+        source, place = enumerate(frames), 0
+        kept: dict[int, tuple[Picture, torch.device | None] | ValueError] = {}
+        views: dict[int, View] = {}  # of the frames that may vote
 
         def read_up_to(last: int) -> None:
-            numbers = range(max(kept, default=place - 1) + 1, last + 1)
-            for number, frame in zip(numbers, source, strict=False):
+            while max(kept, default=place - 1) < last and (following := next(source, None)) is not None:
+                number, frame = following
                 try:
-                    kept[number] = _read_frame(frame, number, unit)
+                    picture, _ = kept[number] = _read_frame(frame, number, unit)
                 except ValueError as error:
                     kept[number] = error
+                    continue
+                if picture.pose is not None and not _is_empty(picture):
+                    views[number] = view_of(picture, picture.pose)
 
         while True:
             read_up_to(place)
@@ -247,55 +252,52 @@ class Upsampler:
                 return
             if isinstance(given, ValueError):
                 raise given
-            if neighbours and given.picture.pose is not None:
+            picture, device = given
+            voting: list[View] | None = None
+            if neighbours and picture.pose is not None:
                 read_up_to(place + max(neighbours - place, -(-neighbours // 2)))
-            yield self._voted(given, kept, place, neighbours)
+                near = nearest(place, max(kept) + 1, neighbours, views.__contains__)
+                voting = [views[number] for number in near]
+            with naming(f"frame {place}"), python_messages():
+                surface = self._upsample(picture, device, voting, look=place == 0)
+            yield surface
             place += 1
             kept.pop(place - neighbours - 1, None)
+            views.pop(place - neighbours - 1, None)
 
-    def _voted(self, given: Given, kept: dict[int, Given | ValueError], place: int, neighbours: int) -> Surface[Any]:
-        """Return the surface of a frame of a stream, on whose depth others vote."""
-        pictures = {number: each.picture for number, each in kept.items() if isinstance(each, Given)}
-
-        def posed(number: int) -> bool:
-            return number in pictures and pictures[number].pose is not None and not _is_empty(pictures[number])
-
-        def fuse(picture: Picture) -> Picture:
-            if not neighbours or picture.pose is None:
-                return picture
-            near = [pictures[each] for each in nearest(place, max(kept) + 1, neighbours, posed)]
-            views = [View(each.depth_lr, camera_lr(each), each.pose) for each in near if each.pose is not None]
-            return vote(picture, views, len(views))
-
-        with naming(f"frame {place}"), python_messages():
-            if _is_empty(given.picture):
-                return self._without_depth(given)
-            picture, identified = prepare(given.picture, self._sensor, fuse)
-            return self._finish(picture, identified, given, None, look=place == 0)
-
-    def _without_depth(self, given: Given) -> Surface[Any]:
-        """Return the surface of a frame in which a camera measured nothing: holes, of which nothing is known."""
-        picture = given.picture
-        size, size_lr = ((each.shape[-2], each.shape[-1]) for each in (picture.rgb, picture.depth_lr))
-        holes = torch.full((1, *size), torch.nan)
-        found = base.Surface(holes, holes, holes, filled=torch.zeros_like(holes, dtype=torch.bool))
-        return Surface(picture, found, self._run.plan(size, size_lr), 0.0, given.device)
-
-    def _finish(
-        self, picture: Picture, sensor: Identified | None, given: Given, progress: Steps | None, *, look: bool
+    def _upsample(
+        self,
+        picture: Picture,
+        device: torch.device | None,
+        voting: Sequence[View] | None = None,
+        progress: Steps | None = None,
+        *,
+        look: bool = True,
     ) -> Surface[Any]:
-        """Return the surface of a picture that is prepared; ``look`` whether its photo and depth fit each other."""
-        size, size_lr = ((each.shape[-2], each.shape[-1]) for each in (picture.rgb, picture.depth_lr))
+        """Return the surface of a picture on whose depth others vote; ``look`` whether photo and depth fit each other.
+
+        One without any measurement has holes, of which nothing is known.
+        """
+        size, size_lr = size_of(picture.rgb), size_of(picture.depth_lr)
+        if _is_empty(picture):
+            holes = torch.full((1, *size), torch.nan)
+            found = base.Surface(holes, holes, holes, filled=torch.zeros_like(holes, dtype=torch.bool))
+            return Surface(picture, found, self._run.plan(size, size_lr), 0.0, device)
+        fuse = (lambda each: each) if voting is None else functools.partial(vote, views=voting, count=len(voting))
+        picture, sensor = prepare(picture, self._sensor, fuse)
         planned = self._run.plan(size, size_lr)  # which refuses sizes before anything is looked at
         if look:
-            picture = replace(picture, assumptions=(*picture.assumptions, *doubts_of(picture)))
+            view = picture.camera.rescale(size_lr[1], size_lr[0])
+            doubts = [*doubt_camera(picture.camera, "camera", size_lr),
+                      *doubt_depth(picture.depth_lr, view, "orthogonal")]  # fmt: skip
+            picture = replace(picture, assumptions=(*picture.assumptions, *doubts))
         if look or self._register:
             picture = align(picture, register=self._register)
         warn(note for note in picture.assumptions if note.code)
         started = time.perf_counter()
         with self._lock:
             found = self._run.upsample(picture.rgb, picture.depth_lr, picture.camera, progress, sensor)
-        return Surface(picture, as_stored(found), planned, time.perf_counter() - started, given.device)
+        return Surface(picture, as_stored(found), planned, time.perf_counter() - started, device)
 
 
 def _is_empty(picture: Picture) -> bool:
@@ -303,12 +305,17 @@ def _is_empty(picture: Picture) -> bool:
     return bool(picture.depth_lr.isnan().all())
 
 
-def _read_frame(frame: Any, number: int, unit: str | float | None) -> Given:
-    """Return a frame of a stream."""
+def _device_of(depth: Any) -> torch.device | None:
+    """Return the device of a depth map that was given as a tensor."""
+    return depth.device if isinstance(depth, Tensor) else None
+
+
+def _read_frame(frame: Any, number: int, unit: str | float | None) -> tuple[Picture, torch.device | None]:
+    """Return a frame of a stream, and the device of its depth if that is a tensor."""
     with naming(f"frame {number}"), python_messages():
         if not isinstance(frame, tuple | list) or len(frame) not in (3, 4):
             came = f"{len(frame)} of them" if isinstance(frame, tuple | list) else type(frame).__name__
             raise ValueError(f"expected (rgb, depth, camera) or (rgb, depth, camera, pose), got {came}")
         rgb, depth, camera, pose = (*frame, None)[:4]
-        given = picture_of(rgb, depth, camera, unit=unit, pose=pose, empty=True)
-        return given if _is_empty(given.picture) else replace(given, picture=without_repeats(given.picture))
+        picture = picture_of(rgb, depth, camera, unit=unit, pose=pose, empty=True)
+        return picture if _is_empty(picture) else without_repeats(picture), _device_of(depth)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from dsr.geometry.camera import Camera
 from dsr.geometry.plausible import expect_possible
 from dsr.geometry.poses import as_rigid
 from dsr.inference.any_ratio import expect_picture
-from dsr.io.cameras import doubt_camera, doubt_depth
 from dsr.io.depth_files import Encoding, decode, far_marks, find_holes, turn_back_bits
 from dsr.io.files import metres_in
 from dsr.io.images import used_bits
@@ -26,21 +24,14 @@ from dsr.notes import Assumption, warn
 _METRES = Encoding(".npy", "float32", 1.0, math.nan, "orthogonal")
 
 
-@dataclass(frozen=True)
-class Given:
-    """A picture on the CPU, and the device of its depth if that was given as a tensor."""
-
-    picture: Picture
-    device: torch.device | None
-
-
 def picture_of(
     rgb: Any, depth: Any, camera: Any, *, mask: Any = None, unit: str | float | None = None, pose: Any = None,
     empty: bool = False,
-) -> Given:  # fmt: skip
-    """Convert the user's arguments to a picture, see :func:`dsr.upsample`, whose depth may be ``empty``: all holes.
+) -> Picture:  # fmt: skip
+    """Convert the user's arguments to a picture on the CPU, see :func:`dsr.upsample`.
 
-    The pose is from camera to world, (4, 4) or (3, 4), in metres. An error begins with the argument's name.
+    The pose is from camera to world, (4, 4) or (3, 4), in metres; depth may be all holes if ``empty`` says so. An error
+    begins with the argument's name.
     """
     if not isinstance(camera, Camera):
         raise ValueError(f"camera: expected a dsr.Camera, got {_kind(camera)}; see dsr.Camera.from_matrix")
@@ -60,20 +51,7 @@ def picture_of(
         expect_picture(photo, depth_lr, camera)
     if pose is not None:
         pose = as_rigid(pose.detach().cpu().double().numpy() if isinstance(pose, Tensor) else pose, "pose")
-    device = given.device if isinstance(given, Tensor) else None
-    return Given(Picture(photo, depth_lr, camera, encoding, (), pose), device)
-
-
-def doubts_of(picture: Picture) -> list[Assumption]:
-    """Return warnings of a picture's camera and distances, as for files."""
-    size_lr = (picture.depth_lr.shape[-2], picture.depth_lr.shape[-1])
-    view = picture.camera.rescale(size_lr[1], size_lr[0])
-    return [*doubt_camera(picture.camera, "camera", size_lr), *doubt_depth(picture.depth_lr, view, "orthogonal")]
-
-
-def is_batch(rgb: Any, depth: Any) -> bool:
-    """Return whether there are several pictures: lists of them, or photos with an axis more."""
-    return isinstance(rgb, list | tuple) or isinstance(depth, list | tuple) or getattr(rgb, "ndim", 0) == 4
+    return Picture(photo, depth_lr, camera, encoding, (), pose)
 
 
 def pictures_of(rgb: Any, depth: Any, camera: Any, mask: Any) -> Iterator[dict[str, Any]]:
@@ -93,7 +71,10 @@ def pictures_of(rgb: Any, depth: Any, camera: Any, mask: Any) -> Iterator[dict[s
 def _photo(rgb: Any, camera: Camera) -> Tensor:
     """Return a photo as (3, H, W) float32 in [0, 1]; the range of floats is not checked."""
     if hasattr(rgb, "convert") and hasattr(rgb, "mode"):  # a picture of PIL, which need not be imported for it
-        rgb = _of_pil(rgb)
+        if rgb.mode in ("I", "F"):
+            raise ValueError(f"rgb: expected a picture of PIL of 8 bits, or of mode I;16, got mode {rgb.mode}")
+        deep = rgb.mode.startswith("I;16")  # which Pillow itself would clip to 8 bits
+        rgb = np.repeat(np.asarray(rgb)[..., None], 3, axis=-1) if deep else rgb.convert("RGB")
     given = _values(rgb, "rgb")
     own, axes = ("(3, H, W)", (0, 1, 2)) if isinstance(given, Tensor) else ("(H, W, 3)", (2, 0, 1))
     size = (camera.height, camera.width)
@@ -110,15 +91,6 @@ def _photo(rgb: Any, camera: Camera) -> Tensor:
     if not photo.is_floating_point():
         raise ValueError(f"rgb: expected values of 8 or 16 bits, or floats from 0 to 1, got {_kind(given)}")
     return photo.float().clone()  # the caller may use its buffer again
-
-
-def _of_pil(rgb: Any) -> Any:
-    """Return a picture of PIL as RGB, (H, W, 3) uint16 for one of 16 bits; Pillow itself would clip it to 8."""
-    if rgb.mode.startswith("I;16"):
-        return np.repeat(np.asarray(rgb)[..., None], 3, axis=-1)
-    if rgb.mode in ("I", "F"):
-        raise ValueError(f"rgb: expected a picture of PIL of 8 bits, or of mode I;16, got mode {rgb.mode}")
-    return rgb.convert("RGB")
 
 
 def _metres(stored: np.ndarray, unit: str | float | None, camera: Camera) -> tuple[Tensor, Encoding]:

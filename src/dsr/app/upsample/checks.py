@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dsr.app.upsample.sequence import FrameSequence
+from dsr.app.upsample.frames import FrameSequence
 from dsr.geometry.agreement import (
     Outlines,
     Size,

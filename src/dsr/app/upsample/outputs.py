@@ -7,7 +7,7 @@ import json
 import math
 import platform
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -21,7 +21,7 @@ from dsr.app.upsample.parts import ERRORS, FILES, METRES, PARTS, Results
 from dsr.app.upsample.stored import INFO, read_depth, read_errors, read_info
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import ERROR_SHARE, FLATNESS
-from dsr.inference import Plan
+from dsr.inference.resizing import Plan
 from dsr.io.depth_files import IN_METRES, Encoding, encode, storable, write_depth_file
 from dsr.io.exports import (
     FLAT,
@@ -79,18 +79,6 @@ class Result:
         """The shares of the pixels, see :meth:`dsr.methods.base.Surface.shares`."""
         return self.surface.shares(self.wanted.max_error / 100)
 
-    @functools.cached_property
-    def certain(self) -> tuple[Tensor | None, tuple[Assumption, ...]]:
-        """The depth, (1, H, W), without pixels that are likely to be wrong, None if none is left; and notes."""
-        limit, notes = self.wanted.max_error / 100, list[Assumption]()
-        depth, share = self.surface.without_dubious(limit).depth, self.shares.get("dubious", 0.0)
-        if share >= _WORTH_SAYING:
-            text = f"{share:.1%} of the pixels, expected to be off by more than {limit:.1%} of their depth"
-            notes.append(Assumption("left out of cloud and mesh", text))
-        if bool(depth.isfinite().any()):
-            return depth, tuple(notes)
-        return None, (*notes, Assumption("no cloud and no mesh", "no pixel is left"))
-
 
 class Output(NamedTuple):
     """What a part wrote: the names of the files, notes for the user, and how much of a shape."""
@@ -98,14 +86,6 @@ class Output(NamedTuple):
     files: Sequence[str]
     notes: Sequence[Assumption] = ()
     shape: Written | None = None
-
-
-class Stored(NamedTuple):
-    """A result that was written: notes on its parts, the seconds of all stages, and the bytes of its files."""
-
-    notes: Sequence[Assumption]
-    seconds: Mapping[str, float]
-    size: int
 
 
 class ResultFolder:
@@ -128,6 +108,12 @@ class ResultFolder:
     def same(self) -> bool:
         """Whether the earlier run had the same inputs and settings."""
         return (self.earlier.get("inputs"), self.earlier.get("settings")) == (self.inputs, self.settings)
+
+    @property
+    def size(self) -> int:
+        """The bytes of ``info.json`` and of those files that have not been removed since."""
+        paths = [self.path / name for name in (*self.earlier["files"], INFO)]
+        return sum(path.stat().st_size for path in paths if path.is_file())
 
     @property
     def reusable(self) -> bool:
@@ -179,79 +165,69 @@ class ResultFolder:
         if not self.reusable:
             return None
         try:
-            depth = torch.from_numpy(read_depth(self.path, camera))[None]
+            surface = Surface(torch.from_numpy(read_depth(self.path, camera))[None])
+            if errors or (self.path / ERRORS).is_file():
+                depth_error, angle_error = (torch.from_numpy(each)[None] for each in read_errors(self.path, camera))
+                surface = surface._replace(depth_error=depth_error, angle_error=angle_error)
         except (OSError, ValueError):
             return None
-        try:
-            depth_error, angle_error = read_errors(self.path, camera)
-        except (OSError, ValueError):
-            return None if errors else Surface(depth)
-        return Surface(depth, torch.from_numpy(depth_error)[None], torch.from_numpy(angle_error)[None])
+        return surface
 
-    def store(self, result: Result, seconds: Mapping[str, float], *, reused: bool = False) -> Stored:
-        """Write the parts of a result and ``info.json``, which says that it is not complete until the end.
+    def store(self, result: Result, seconds: Mapping[str, float], *, reused: bool = False) -> list[Assumption]:
+        """Write the parts of a result and ``info.json``, which says when it is complete; return notes on the parts.
 
         Files of an earlier run with the same inputs and settings stay. ``seconds`` are those of the stages before; if
         the depth of the earlier run is ``reused``, its stages count, too.
         """
-        started, earlier = time.perf_counter(), self.earlier
-        kept = earlier if self.same else {}
+        started, kept = time.perf_counter(), dict(self.earlier) if self.same else {}
+        for name in () if kept else self.earlier.get("files", ()):
+            if name in FILES:
+                (self.path / name).unlink(missing_ok=True)
         depends_on = {"inputs": self.inputs, "settings": self.settings}
-        self._write_info({"complete": False, **depends_on, "files": list(earlier.get("files", ()))})
+        self._write({"complete": False, **depends_on, "files": kept.get("files", [])})
         picture, surface = result.picture, result.surface
         outputs = write_parts(self.path, result)
-        files = [name for output in outputs.values() for name in output.files]
+        files = list(dict.fromkeys(name for output in outputs.values() for name in output.files))
         facts = list(dict.fromkeys(note for output in outputs.values() for note in output.notes))
-        counts = {name: kept[name] for name, part in PARTS.items() if part.shape and name in kept.keys() - outputs}
-        for output in outputs.values():
-            of_shape = (name for name in outputs if set(PARTS[name].files) & set(output.files))
-            counts |= {} if output.shape is None else dict.fromkeys(of_shape, output.shape._asdict())
-        outliers = kept.get("outliers") if surface.outliers is None else surface.outliers._asdict()
-        if outliers is not None:
-            counts["outliers"] = outliers
         others = [name for name in kept.get("files", ()) if name not in files]
         notes = (*picture.assumptions, *facts)
         known = ("warning: ", *(note.text for note in notes))
         said = [each for each in (kept.get("assumptions", ()) if others else ()) if not each.startswith(known)]
-        seconds = {**seconds, "writing": time.perf_counter() - started}
-        before = earlier["seconds"] if reused else {}
-        together = {stage: before.get(stage, 0.0) + seconds.get(stage, 0.0) for stage in {**before, **seconds}}
-        shares = {name: round(share, 6) for name, share in result.shares.items()}
-        entries = {
-            **depends_on,
-            "method": result.plan.method,
-            "scale": result.plan.scale,
-            "plan": result.plan.text,
-            "noise": surface.noise._asdict() if surface.noise else kept.get("noise"),
-            **_described(picture, result.encoding),
-            **counts,
-            "shares": {**kept.get("shares", {}), **shares},
-            "assumptions": [*map(str, notes), *said],
-            "checks": CHECKS,
-            "warnings": [note.record() for note in notes if note.code],
-            "seconds": _with_total(together),
-            "versions": {"python": platform.python_version(), **package_versions(_PACKAGES)},
-        }
-        files += others
-        for name in earlier.get("files", ()):
-            if name not in files and name in FILES:
-                (self.path / name).unlink(missing_ok=True)
-        self._write_info({"complete": True, **entries, "files": files})
-        return Stored(facts, _with_total(seconds), bytes_of(self.path, files))
+        before = kept["seconds"] if reused else {}
+        stages = {**seconds, "writing": time.perf_counter() - started}
+        stages = {name: round(before.get(name, 0.0) + each, 3) for name, each in stages.items()}
+        counts = {name: output.shape._asdict() for name, output in outputs.items() if output.shape is not None}
+        if surface.outliers is not None:
+            counts["outliers"] = surface.outliers._asdict()
+        self._write(
+            {
+                **{name: each for name, each in kept.items() if name not in outputs},
+                "complete": True,
+                **depends_on,
+                "method": result.plan.method,
+                "scale": result.plan.scale,
+                "plan": result.plan.text,
+                "noise": surface.noise._asdict() if surface.noise else kept.get("noise"),
+                **_described(picture, result.encoding),
+                **counts,
+                "shares": {
+                    **kept.get("shares", {}),
+                    **{name: round(share, 6) for name, share in result.shares.items()},
+                },
+                "assumptions": [*map(str, notes), *said],
+                "checks": CHECKS,
+                "warnings": [note.record() for note in notes if note.code],
+                "seconds": {**stages, "total": round(sum(stages.values()), 3)},
+                "versions": {"python": platform.python_version(), **package_versions(_PACKAGES)},
+                "files": [*files, *others],
+            }
+        )
+        return facts
 
-    def _write_info(self, entries: Mapping[str, Any]) -> None:
-        write_text(self.path / INFO, json.dumps(entries, indent=2) + "\n")
-
-
-def _with_total(seconds: Mapping[str, float]) -> dict[str, float]:
-    """Return the seconds of stages, to milliseconds, with their sum as ``total``."""
-    found = {stage: round(each, 3) for stage, each in seconds.items() if stage != "total"}
-    return {**found, "total": round(sum(found.values()), 3)}
-
-
-def bytes_of(folder: Path, files: Iterable[str]) -> int:
-    """Return the bytes of ``info.json`` and of those files that have not been removed since."""
-    return sum((folder / name).stat().st_size for name in (*files, INFO) if (folder / name).is_file())
+    def _write(self, info: dict[str, Any]) -> None:
+        """Write ``info.json``."""
+        write_text(self.path / INFO, json.dumps(info, indent=2) + "\n")
+        self.earlier = info
 
 
 def _described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
@@ -290,19 +266,51 @@ def as_stored(surface: Surface) -> Surface:
 
 
 def write_parts(folder: Path, result: Result) -> dict[str, Output]:
-    """Write the parts of a picture's result into its folder, and return what each has written, by name."""
-    names = [part.name for part in result.wanted.of_frame]
+    """Write the parts of a frame's result into its folder, and return what each has written, by name."""
     with ThreadPoolExecutor(1) as beside:  # shapes take as long as all the rest
-        shapes = {name: beside.submit(_WRITERS[name], folder, result) for name in names if PARTS[name].shape}
-        written = {name: _WRITERS[name](folder, result) for name in names if not PARTS[name].shape}
-        written |= {name: shape.result() for name, shape in shapes.items()}
-    return {name: Output(PARTS[name].files) if (output := written[name]) is None else output for name in names}
+        shapes = beside.submit(_write_shapes, folder, result)
+        written = _write_maps(folder, result)
+        written |= shapes.result()
+    return {part.name: written[part.name] for part in result.wanted.of_frame}
 
 
-def _depth(folder: Path, result: Result) -> Output:
+def _write_maps(folder: Path, result: Result) -> dict[str, Output]:
+    """Write what is no shape."""
+    names = [part.name for part in result.wanted.of_frame]
+    picture, surface, camera = result.picture, result.surface, result.picture.camera
+    written = {name: Output(PARTS[name].files) for name in names}
+    if "depth" in names:
+        written["depth"] = _write_depth(folder, result)
+    if "renderings" in names:
+        write_renderings(folder / "renderings", surface.depth, camera)
+    if "normals" in names:
+        write_normals(folder / "normals.png", surface.depth, camera)
+    if "before_after" in names:
+        from dsr.pictures.before_after import write_before_after  # noqa: PLC0415 - Matplotlib, which takes a second
+
+        title = ", ".join(filter(None, (result.name, f"{result.plan.method} x{result.plan.scale}")))
+        path = folder / "before_after.png"
+        write_before_after(path, picture.rgb, picture.depth_lr, surface.depth, camera, title)
+    if "confidence" in names and surface.depth_error is not None and surface.angle_error is not None:
+        from dsr.pictures.expected_errors import write_confidence  # noqa: PLC0415 - as above
+
+        write_confidence(folder / "confidence.png", surface.depth, surface.depth_error, surface.angle_error)
+        with replacing(folder / ERRORS) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **surface.error_arrays())
+    if "filled" in names and surface.filled is not None:
+        write_mask(folder / "filled.png", surface.filled)
+    if "input" in names:
+        write_input(folder / INPUT, picture.rgb, picture.depth_lr)
+    if "rgbd" in names:
+        notes = write_rgbd(folder / "rgbd", picture.rgb, surface.depth, camera)
+        written["rgbd"] = Output([f"rgbd/{name}" for name in RGBD], notes)
+    return written
+
+
+def _write_depth(folder: Path, result: Result) -> Output:
     """Write the depth in metres without loss, and in the output's encoding if that is another one."""
     depth, encoding = result.surface.depth, result.encoding
-    write_depth_file(folder / METRES, depth[0].float().cpu().numpy())
+    write_depth_file(folder / METRES, depth[0].numpy())
     if encoding is IN_METRES:
         return Output((METRES,))
     values, lost = encode(depth, encoding, result.picture.camera)
@@ -317,102 +325,46 @@ def _depth(folder: Path, result: Result) -> Output:
     return Output((name, METRES), notes)
 
 
-def _renderings(folder: Path, result: Result) -> None:
-    write_renderings(folder / "renderings", result.surface.depth, result.picture.camera)
-
-
-def _normals(folder: Path, result: Result) -> None:
-    write_normals(folder / "normals.png", result.surface.depth, result.picture.camera)
-
-
-def _cloud(folder: Path, result: Result) -> Output:
-    depth, notes = result.certain
-    if depth is None:
-        return Output((), notes)
-    picture, most, filled = result.picture, result.wanted.max_points, result.surface.filled
-    shape = write_cloud(folder / "cloud.ply", picture.rgb, depth, picture.camera, most=most, filled=filled)
-    return Output(("cloud.ply",), (*notes, *_fewer("cloud", "points", "--max-points", shape)), shape)
-
-
-def _mesh(folder: Path, result: Result) -> Output:
-    """Write the meshes that are asked for."""
-    depth, notes = result.certain
-    if depth is None:
-        return Output((), notes)
+def _write_shapes(folder: Path, result: Result) -> dict[str, Output]:
+    """Write the meshes and the cloud, of the pixels that are not likely to be wrong."""
+    names = [part.name for part in result.wanted.of_frame if part.shape]
+    if not names:
+        return {}
+    limit, notes = result.wanted.max_error / 100, list[Assumption]()
+    if (share := result.shares.get("dubious", 0.0)) >= _WORTH_SAYING:
+        text = f"{share:.1%} of the pixels, expected to be off by more than {limit:.1%} of their depth"
+        notes.append(Assumption("left out of cloud and mesh", text))
+    depth = result.surface.without_dubious(limit).depth
+    if not bool(depth.isfinite().any()):
+        notes.append(Assumption("no cloud and no mesh", "no pixel is left"))
+        return {name: Output((), notes) for name in names}
+    written: dict[str, Output] = {}
     picture, wanted, filled = result.picture, result.wanted, result.surface.filled
-    files = [PARTS[name].files[0] for name in ("mesh", "mesh_ply") if name in wanted.names]
-    tolerance = None
-    if wanted.keep != "all":
-        tolerance = FLATNESS * depth
-        if (error := result.surface.depth_error) is not None:
-            tolerance = tolerance.maximum(ERROR_SHARE * error)
-    paths = [folder / name for name in files]
-    try:
-        shape = write_mesh(
-            paths, picture.rgb, depth, picture.camera, most=wanted.max_faces, tolerance=tolerance, filled=filled
+    if meshes := [name for name in names if name != "cloud"]:
+        files = [PARTS[name].files[0] for name in meshes]
+        tolerance = None
+        if wanted.keep != "all":
+            tolerance = FLATNESS * depth
+            if (error := result.surface.depth_error) is not None:
+                tolerance = tolerance.maximum(ERROR_SHARE * error)
+        try:
+            shape = write_mesh(
+                [folder / name for name in files], picture.rgb, depth, picture.camera, most=wanted.max_faces,
+                tolerance=tolerance, filled=filled,
+            )  # fmt: skip
+            of_mesh = (*notes, *_fewer("mesh", "triangles", "--max-faces", shape))
+            written |= {name: Output(files, of_mesh, shape) for name in meshes}
+        except ValueError as error:
+            written |= {name: Output((), (*notes, Assumption("no mesh", str(error)))) for name in meshes}
+    if "cloud" in names:
+        shape = write_cloud(
+            folder / "cloud.ply", picture.rgb, depth, picture.camera, most=wanted.max_points, filled=filled
         )
-    except ValueError as error:
-        return Output((), (*notes, Assumption("no mesh", str(error))))
-    return Output(files, (*notes, *_fewer("mesh", "triangles", "--max-faces", shape)), shape)
-
-
-def _mesh_ply(folder: Path, result: Result) -> Output:
-    return Output(()) if "mesh" in result.wanted.names else _mesh(folder, result)
+        written["cloud"] = Output(("cloud.ply",), (*notes, *_fewer("cloud", "points", "--max-points", shape)), shape)
+    return written
 
 
 def _fewer(part: str, what: str, option: str, shape: Written) -> list[Assumption]:
     """Return a note on a shape that a limit has made smaller."""
     text = f"the {part} has fewer {what} than the depth map gives ({option})"
     return [Assumption(text, str(shape))] if shape.how not in ("", FLAT) else []
-
-
-def _before_after(folder: Path, result: Result) -> None:
-    from dsr.pictures.before_after import write_before_after  # noqa: PLC0415 - Matplotlib, which takes a second
-
-    picture, plan = result.picture, result.plan
-    title = ", ".join(filter(None, (result.name, f"{plan.method} x{plan.scale}")))
-    path = folder / "before_after.png"
-    write_before_after(path, picture.rgb, picture.depth_lr, result.surface.depth, picture.camera, title)
-
-
-def _confidence(folder: Path, result: Result) -> Output | None:
-    from dsr.pictures.expected_errors import write_confidence  # noqa: PLC0415 - as above
-
-    surface = result.surface
-    if surface.depth_error is None or surface.angle_error is None:
-        return Output(())
-    write_confidence(folder / "confidence.png", surface.depth, surface.depth_error, surface.angle_error)
-    with replacing(folder / ERRORS) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **surface.error_arrays())
-    return None
-
-
-def _filled(folder: Path, result: Result) -> Output | None:
-    if result.surface.filled is None:
-        return Output(())
-    write_mask(folder / "filled.png", result.surface.filled)
-    return None
-
-
-def _input(folder: Path, result: Result) -> None:
-    write_input(folder / INPUT, result.picture.rgb, result.picture.depth_lr)
-
-
-def _rgbd(folder: Path, result: Result) -> Output:
-    notes = write_rgbd(folder / "rgbd", result.picture.rgb, result.surface.depth, result.picture.camera)
-    return Output([f"rgbd/{name}" for name in RGBD], notes)
-
-
-_WRITERS: Mapping[str, Callable[[Path, Result], Output | None]] = {
-    "depth": _depth,
-    "renderings": _renderings,
-    "normals": _normals,
-    "mesh": _mesh,
-    "before_after": _before_after,
-    "confidence": _confidence,
-    "filled": _filled,
-    "input": _input,
-    "mesh_ply": _mesh_ply,
-    "cloud": _cloud,
-    "rgbd": _rgbd,
-}

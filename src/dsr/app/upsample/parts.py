@@ -26,8 +26,7 @@ class Part(NamedTuple):
 
     name: str  # in the options
     files: tuple[str, ...]  # all files or folders that it may write
-    of_all: bool = False  # whether it is written of all frames together
-    needs: tuple[str, ...] = ()  # parts of each frame that it is made of
+    of_all: bool = False  # whether it is written of all frames together, of their depth and rgbd
     usual: bool = True  # whether it is written unless something else is asked for
     large: bool = False  # whether ``--keep all`` writes it, too
     shape: bool = False  # whether it takes as long as all the rest, and is written beside it
@@ -35,14 +34,7 @@ class Part(NamedTuple):
     poses: bool = False  # whether it needs a pose of each frame, where there are several
     library: tuple[str, str, str] | None = None  # module that it needs, its package, and the extra that installs it
 
-    def check_library(self) -> None:
-        """Raise ValueError if the library is not installed."""
-        if self.library is not None and importlib.util.find_spec(self.library[0]) is None:
-            _, package, extra = self.library
-            raise ValueError(f"--with {self.name}: expected the library {package}; {how_to_install(extra)}")
 
-
-_OF_DEPTH = ("depth", "rgbd")
 PARTS: dict[str, Part] = {
     part.name: part
     for part in (
@@ -57,10 +49,10 @@ PARTS: dict[str, Part] = {
         Part("mesh_ply", ("mesh.ply",), usual=False, large=True, shape=True, errors=True),
         Part("cloud", ("cloud.ply",), usual=False, large=True, shape=True, errors=True),
         Part("rgbd", ("rgbd/color.png", "rgbd/depth.png", "rgbd/intrinsic.json"), usual=False),
-        Part("open3d", ("open3d",), of_all=True, needs=_OF_DEPTH, usual=False),
-        Part("nerfstudio", ("transforms.json", "nerfstudio"), of_all=True, needs=_OF_DEPTH, usual=False, poses=True),
-        Part("gaussian", ("gaussian",), of_all=True, needs=_OF_DEPTH, usual=False, poses=True),
-        Part("rerun", ("scene.rrd",), of_all=True, needs=_OF_DEPTH, usual=False,
+        Part("open3d", ("open3d",), of_all=True, usual=False),
+        Part("nerfstudio", ("transforms.json", "nerfstudio"), of_all=True, usual=False, poses=True),
+        Part("gaussian", ("gaussian",), of_all=True, usual=False, poses=True),
+        Part("rerun", ("scene.rrd",), of_all=True, usual=False,
              library=("rerun", "rerun-sdk", "rerun")),
     )
 }  # fmt: skip
@@ -140,7 +132,9 @@ class Results(Options):
         if not self.names:
             raise ValueError("--only, --without: expected something to be left to write, got nothing")
         for part in self.of_all:
-            part.check_library()
+            if part.library is not None and importlib.util.find_spec(part.library[0]) is None:
+                _, package, extra = part.library
+                raise ValueError(f"--with {part.name}: expected the library {package}; {how_to_install(extra)}")
 
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
@@ -152,8 +146,8 @@ class Results(Options):
     @functools.cached_property
     def of_frame(self) -> tuple[Part, ...]:
         """Parts that are written for each frame, including those that other parts need."""
-        needed = {need for name in self.names for need in PARTS[name].needs}
-        return tuple(part for part in PARTS.values() if not part.of_all and part.name in {*self.names, *needed})
+        needed = {*self.names, "depth", "rgbd"} if self.of_all else set(self.names)
+        return tuple(part for part in PARTS.values() if not part.of_all and part.name in needed)
 
     @functools.cached_property
     def of_all(self) -> tuple[Part, ...]:

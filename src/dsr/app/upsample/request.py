@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from dsr.app.requests import check_method
 from dsr.app.upsample.parts import Results
-from dsr.inference.defaults import DEFAULT, WIDEST, Fill
+from dsr.inference import DEFAULT, WIDEST, Fill
 from dsr.io.reading import Reading, Shard, parse_shard
 from dsr.utils.options import OptionError, Options, Rule, group, option, positive, recorded
 from dsr.utils.versions import file_hash, hash_outside_code
 
 if TYPE_CHECKING:
-    from dsr.inference import AnyRatio
+    from dsr.inference.any_ratio import AnyRatio
     from dsr.io.frames import Record, Source
     from dsr.io.pairs import Pair
 
@@ -203,7 +203,7 @@ class Upsampling(Options):
 
     def upsampler(self) -> AnyRatio:
         """Return the method, which loads its weights once; a ValueError if there is no such device."""
-        from dsr.inference import upsampler  # noqa: PLC0415 - other values are refused without torch
+        from dsr.inference.any_ratio import upsampler  # noqa: PLC0415 - other values are refused without torch
 
         return upsampler(
             self.method,

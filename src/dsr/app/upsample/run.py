@@ -3,133 +3,134 @@
 from __future__ import annotations
 
 import contextlib
-import errno
+import functools
 import json
 import os
 import time
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from dsr.app.upsample.frame import Done, FrameWork, Message, Tell
-from dsr.app.upsample.frames import Frames, find_frames
-from dsr.app.upsample.request import UpsampleRequest
-from dsr.app.upsample.stored import EXPORTS, read_complete, write_scene
+from dsr.app.upsample.checks import align, check_together
+from dsr.app.upsample.frames import Frames, FrameSequence, find_frames, prepare, without_repeats
+from dsr.app.upsample.outputs import Result, ResultFolder, as_stored
+from dsr.app.upsample.request import UpsampleRequest, Upsampling, files_of, inputs_with_neighbours
+from dsr.app.upsample.stored import EXPORTS, INFO, warnings_of, write_scene
+from dsr.inference.any_ratio import AnyRatio
+from dsr.inference.plausibility import find_filled
+from dsr.inference.resizing import size_of
 from dsr.io.images import pixels_in_header
-from dsr.io.inputs import read_geometry
+from dsr.io.inputs import Picture, read_geometry, read_picture
 from dsr.io.pairs import Pair
-from dsr.io.reading import Shard
 from dsr.io.scene_files import expect_poses
 from dsr.io.trajectories import USUAL_SIZE, read_poses
-from dsr.notes import Assumption
-from dsr.utils.console import ConsoleProgress, show
+from dsr.methods.base import MapNoise, Surface
+from dsr.methods.glass import NOTED
+from dsr.notes import Assumption, expect_no_warning
+from dsr.utils.console import ConsoleProgress, one_line, show
 from dsr.utils.files import expect_targets, write_text
-from dsr.utils.processes import Pool, at_work
-from dsr.utils.progress import Progress, clock, megabytes
+from dsr.utils.guards import readable, refusing_excess
+from dsr.utils.processes import Pool, at_work, scene_lock
+from dsr.utils.progress import Progress, clock, megabytes, show_length
 
+Message = str | Sequence[Assumption]  # a line, or notes, of which those are shown that no earlier frame had
+Tell = Callable[[Message], object]
 _UNPOSED = {  # what is written of a single frame without a pose, by part
     "gaussian": ": images, depths and depth_params.json are written, and no sparse model; --poses gives one",
     "nerfstudio": ": it stands at the origin",
 }
-_READ_ONLY = (errno.EACCES, errno.EPERM, errno.EROFS)
 _SHOWN = 5  # number of names that a line lists; further ones are only counted
+_KEPT = 2**26  # numbers in the photos that were read last and are kept
+_WHITE = 1.5  # noise that is alike over fewer pixels counts as white
+_GLASS = 0.005  # share of the pixels that look like glass from which it is said
 _work: FrameWork | None = None  # of this process, if it is a worker
 
 
+class Done(NamedTuple):
+    """A frame that was worked on: the outcome with the bytes of its results, or the problem in one line."""
+
+    pair: Pair
+    target: Path
+    outcome: str = ""
+    size: int = 0
+    problem: str | None = None
+
+
 class Reporter:
-    """Shows every note once, and counts the pictures that it applies to."""
+    """Shows every note once, and counts the frames that it applies to."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._counts: Counter[str] = Counter()
-        self._warned: dict[str, Assumption] = {}
+        self._notes: dict[str, list[Assumption]] = {}  # of the frames, by their statement
 
     def tell(self, message: Message) -> None:
-        """Show a line, or the notes that no earlier picture had."""
+        """Show a line, or the notes that no earlier frame had."""
         if isinstance(message, str):
             show(self._console, message)
             return
         for note in message:
-            if not self._counts[note.statement]:
+            if note.statement not in self._notes:
                 show(self._console, f"  {note}")
-            self._counts[note.statement] += 1
-            if note.code:
-                self._warned.setdefault(note.statement, note)
+            self._notes.setdefault(note.statement, []).append(note)
 
-    @property
     def warnings(self) -> list[dict[str, Any]]:
-        """The warnings as values for JSON, each once, as of the first of so many ``pictures``."""
-        return [{**note.record(), "pictures": self._counts[text]} for text, note in self._warned.items()]
+        """Return the warnings as values for JSON, each once, as of the first of so many ``pictures``."""
+        return [{**notes[0].record(), "pictures": len(notes)} for notes in self._notes.values() if notes[0].code]
 
     def summary(self, pictures: int) -> None:
         """Show the notes that apply to some of the pictures only."""
-        for text, count in self._counts.items():
-            if count < pictures:
-                show(self._console, f"  {count} of {pictures} pictures: {text}")
+        for text, notes in self._notes.items():
+            if len(notes) < pictures:
+                show(self._console, f"  {len(notes)} of {pictures} pictures: {text}")
 
 
 def run(request: UpsampleRequest, console: Console) -> list[str]:
-    """Upsample all pictures of a request, and return the problems, one line each.
-
-    Raises:
-        ValueError: the pairs cannot be determined, frames lack poses that a part needs, a file would be written outside
-            of the folder of results, or a command with other settings is at work in it.
-        TargetError: a link, a device, a pipe or a socket is in the place of a file.
-
-    """
+    """Upsample all frames of a request, and return the problems, one line each."""
     frames = find_frames(request)
-    for part in request.results.of_all:
-        if part.poses:
-            posed = _posed(request, frames)
-            expect_poses(part.name, posed)
-            if not all(posed.values()):  # a single one
-                show(console, f"--with {part.name}: the frame has no pose{_UNPOSED.get(part.name, '')}")
-    with contextlib.ExitStack() as stack:
-        if not request.results.dry_run:
-            try:
-                stack.enter_context(at_work(request.results.output, json.dumps(request.settings, sort_keys=True)))
-            except OSError as error:
-                if error.errno not in _READ_ONLY:  # where all may be complete; what is written says so itself
-                    raise
+    _check_poses(request, frames, console)
+    if request.results.dry_run:
+        return _run(request, frames, console)
+    with at_work(request.results.output, json.dumps(request.settings, sort_keys=True)):
         return _run(request, frames, console)
 
 
 def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str]:
-    """Upsample frames, and return the problems."""
+    """Upsample frames in a folder of this command's own, and return the problems."""
     wanted, shard, pairs = request.results, request.frames.shard, frames.found.pairs
     started = time.monotonic()
-    of_all = [*(name for part in wanted.of_all for name in part.files), EXPORTS]
-    expect_targets(wanted.output, of_all if shard is None else [_summary_of(shard)])
-    for line in _found(request, frames):
-        show(console, line)
+    written = [*(name for part in wanted.of_all for name in part.files), EXPORTS]
+    if shard is not None:
+        written = [f"shard-{shard.number}-of-{shard.count}.json"]
+    expect_targets(wanted.output, written)
+    _show_found(request, frames, console)
     reporter = Reporter(console)
-    outcomes: Counter[str] = Counter()
+    finished: list[Done] = []
     problems: dict[str, list[str]] = {}
-    targets: dict[str, Path] = {}
-    size = 0
     for done in work_through(request, frames, reporter.tell, ConsoleProgress(console)):
         if done.problem is None:
-            outcomes[done.outcome] += 1
-            targets[done.pair.name] = done.target
-            size += done.size
+            finished.append(done)
         else:
             problems.setdefault(done.problem, []).append(done.pair.name)
     lines = [f"{_listed(names)}: {message}" if len(pairs) > 1 else message for message, names in problems.items()]
-    if targets and wanted.of_all and not wanted.dry_run and shard is None:
-        scene = write_scene(wanted.output, targets, wanted.of_all, overwrite=wanted.overwrite)
-        for part, path in scene.files.items():
-            show(console, f"{part}: {len(targets)} frames -> {path}")
-        lines += scene.problems
+    if finished and wanted.of_all and not wanted.dry_run and shard is None:
+        folders = {done.pair.name: done.target for done in finished}
+        exports, failures = write_scene(wanted.output, folders, wanted.of_all, overwrite=wanted.overwrite)
+        for part, path in exports.items():
+            show(console, f"{part}: {len(folders)} frames -> {path}")
+        lines += failures
+    outcomes = Counter(done.outcome for done in finished)
     if not frames.single:
         counts = [f"{count} {outcome}" for outcome, count in outcomes.items()]
         counts += [f"{sum(map(len, problems.values()))} failed"] if problems else []
         took = ""
         if not wanted.dry_run:
-            reporter.summary(outcomes.total())
-            took = f" in {clock(time.monotonic() - started)}, {megabytes(size)}"
+            reporter.summary(len(finished))
+            size = megabytes(sum(done.size for done in finished))
+            took = f" in {clock(time.monotonic() - started)}, {size}"
         pictures = "1 picture" if len(pairs) == 1 else f"{len(pairs)} pictures"
         show(console, f"{pictures}: {', '.join(counts) or 'nothing to do'}{took} -> {wanted.output}")
     if shard is not None and not wanted.dry_run:
@@ -137,17 +138,17 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
             "shard": str(shard),
             "outcomes": outcomes,
             "failed": [{"problem": problem, "frames": names} for problem, names in problems.items()],
-            "warnings": reporter.warnings,
+            "warnings": reporter.warnings(),
             "seconds": round(time.monotonic() - started, 3),
         }
-        write_text(wanted.output / _summary_of(shard), json.dumps(summary, indent=2) + "\n")
+        write_text(wanted.output / written[0], json.dumps(summary, indent=2) + "\n")
     return lines
 
 
 def work_through(request: UpsampleRequest, frames: Frames, tell: Tell, progress: Progress) -> Iterator[Done]:
-    """Upsample pictures in ``--workers`` processes, each with its share of the cores; yield each once it is done.
+    """Upsample frames in ``--workers`` processes, each with its share of the cores; yield each once it is done.
 
-    Notes are shown in the order of the pictures, or as they come from several workers.
+    Notes are shown in the order of the frames, or as they come from several workers.
     """
     jobs = [(pair, frames.target(request.results.output, pair)) for pair in frames.found.pairs]
     workers = min(request.frames.workers, len(jobs))
@@ -157,6 +158,7 @@ def work_through(request: UpsampleRequest, frames: Frames, tell: Tell, progress:
         for job in progress.track(jobs, "upsample", label=lambda job: job[0].name, lines=False):
             yield work(*job, tell, progress)
         return
+    del work  # and the frames that it has read
     left, threads = list(jobs), max(1, (os.cpu_count() or 1) // workers)
     with Pool(workers, _begin, (request, frames), threads, progress.say) as pool:
         results = pool.results(_remote, jobs)
@@ -173,62 +175,210 @@ def work_through(request: UpsampleRequest, frames: Frames, tell: Tell, progress:
 
 
 def _begin(request: UpsampleRequest, frames: Frames) -> None:
-    """Prepare a worker."""
+    """Prepare a worker, which reads frames again only for their neighbours."""
     global _work  # noqa: PLW0603 - the process's own
-    _work = FrameWork(request, frames)
+    _work = FrameWork(request, frames, kept=_KEPT if request.frames.neighbours else 0)
 
 
 def _remote(job: tuple[Pair, Path]) -> tuple[Done, list[Message]]:
-    """Upsample a picture in a worker, and return what is to be told of it, too."""
+    """Upsample a frame in a worker, and return what is to be told of it, too."""
     assert _work is not None  # noqa: S101 - workers begin with _begin
     messages: list[Message] = []
     return _work(*job, messages.append, Progress()), messages
 
 
-def _posed(request: UpsampleRequest, frames: Frames) -> dict[str, bool]:
-    """Return whether each frame has a pose, of the file, of its capture or of its result; frames that fail count."""
+def _check_poses(request: UpsampleRequest, frames: Frames, console: Console) -> None:
+    """Refuse frames without a pose, of the file or the capture, for a part that needs one; one alone gets a note."""
+    parts = [part for part in request.results.of_all if part.poses]
+    if not parts:
+        return
     if request.frames.trajectory is not None:
         given = read_poses(request.frames.trajectory).assign(frames.whole)
-        return {pair.name: pair.name in given for pair in frames.whole}
-
-    def posed(pair: Pair) -> bool:
-        try:
-            geometry, _ = read_geometry(pair, pixels_in_header(pair.rgb) or USUAL_SIZE, request.reading)
-        except (ValueError, OSError):
-            return True
-        if geometry.pose is not None:
-            return True
-        try:
-            return read_complete(frames.target(request.results.output, pair)).get("pose") is not None
-        except (ValueError, OSError):
-            return False
-
-    return {pair.name: posed(pair) for pair in frames.whole}
+        posed = {pair.name: pair.name in given for pair in frames.whole}
+    else:
+        posed = {pair.name: True for pair in frames.whole}
+        for pair in frames.whole:
+            with contextlib.suppress(ValueError, OSError):  # it is reported as a frame of its own
+                geometry, _ = read_geometry(pair, pixels_in_header(pair.rgb) or USUAL_SIZE, request.reading)
+                posed[pair.name] = geometry.pose is not None
+    for part in parts:
+        expect_poses(part.name, posed)
+        if not all(posed.values()):  # a single one
+            show(console, f"--with {part.name}: the frame has no pose{_UNPOSED[part.name]}")
 
 
-def _summary_of(shard: Shard) -> str:
-    """Return the name of the summary of a shard."""
-    return f"shard-{shard.number}-of-{shard.count}.json"
-
-
-def _found(request: UpsampleRequest, frames: Frames) -> Iterator[str]:
-    """Yield lines on what was found, which files have no partner, and which frames a shard works on."""
+def _show_found(request: UpsampleRequest, frames: Frames, console: Console) -> None:
+    """Show what was found, which files have no partner, and which frames a shard works on."""
     found, total, shard = frames.found, len(frames.whole), request.frames.shard
     named = total == 1 and len(found.pairs) == 1
-    yield f"{found.pairs[0].rgb} and {found.pairs[0].depth}" if named else f"{total} pairs of photo and depth map"
-    yield from (f"  {fact}" for fact in found.assumptions)
+    lines = [f"{found.pairs[0].rgb} and {found.pairs[0].depth}" if named else f"{total} pairs of photo and depth map"]
+    lines += [f"  {fact}" for fact in found.assumptions]
     if found.unpaired:
         names = _listed([path.name for path in found.unpaired])
-        yield f"  {len(found.unpaired)} without a partner, left out: {names}"
+        lines.append(f"  {len(found.unpaired)} without a partner, left out: {names}")
     if shard is not None:
         block = shard.block(total)
-        yield f"shard {shard}: {f'frames {block.start + 1} to {block.stop}' if block else 'no frame'} of {total}"
+        lines.append(
+            f"shard {shard}: {f'frames {block.start + 1} to {block.stop}' if block else 'no frame'} of {total}"
+        )
         if request.results.of_all:
             names = ", ".join(part.name for part in request.results.of_all)
-            yield f"  {names}: of all frames, by the same command without --shard"
+            lines.append(f"  {names}: of all frames, by the same command without --shard")
+    for line in lines:
+        show(console, line)
 
 
 def _listed(names: Sequence[str]) -> str:
     """Return the first names, and how many more there are."""
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return ", ".join(names[:_SHOWN]) + more
+
+
+class FrameWork:
+    """Upsamples the frames of a request, one at a time; those of other shards are neighbours and determine units.
+
+    Of the photos that were read last so many numbers are ``kept`` for their own turn, or as neighbours.
+    """
+
+    def __init__(self, request: UpsampleRequest, frames: Frames, kept: int = _KEPT) -> None:
+        self._request, self._frames, self._kept = request, frames, kept
+        self._pictures: OrderedDict[str, Picture] = OrderedDict()
+        self._sequence = FrameSequence(frames.whole, self._read, request.frames.neighbours, request.frames.trajectory)
+
+    def check_together(self, jobs: Sequence[tuple[Pair, Path]]) -> Frames:
+        """Return the frames with the warnings that concern several of them, if any of the jobs is to be done."""
+        if any(self._is_to_do(*job) for job in jobs):
+            warnings = check_together(self._frames.whole, self._request.reading, self._read, self._sequence)
+            self._frames = replace(self._frames, warnings=warnings)
+        return self._frames
+
+    def __call__(self, pair: Pair, target: Path, tell: Tell, progress: Progress) -> Done:
+        """Upsample a frame; an error is its problem, and other frames go on."""
+        wanted = self._request.results
+        try:
+            with refusing_excess(), contextlib.ExitStack() as stack:
+                folder = self._folder(pair, target)
+                if not wanted.dry_run and not self._is_done(folder):
+                    stack.enter_context(scene_lock(wanted.output, str(target.relative_to(wanted.output))))
+                    folder.look()  # another command may have been at work there
+                return self._work(pair, folder, tell, progress)
+        except (ValueError, OSError) as error:
+            return Done(pair, target, problem=one_line(error))
+
+    def _work(self, pair: Pair, folder: ResultFolder, tell: Tell, progress: Progress) -> Done:
+        """Upsample a frame that no other command is at."""
+        request, wanted, how = self._request, self._request.results, self._request.upsampling
+        folder.expect_agreement()
+        if self._is_done(folder):
+            warnings = warnings_of(folder.earlier)
+            self._expect_no_warning(pair, folder, warnings)
+            tell(warnings)
+            tell(f"{pair.name}: complete already, in {folder.path}")
+            return Done(pair, folder.path, "complete already", folder.size)
+        begun = time.perf_counter()
+        picture = self._read(pair)
+        picture = replace(picture, assumptions=(*picture.assumptions, *self._frames.warnings.get(pair.name, ())))
+        picture, sensor = prepare(picture, how.sensor, functools.partial(self._sequence.fuse, pair))
+        picture = align(picture, register=request.reading.register)
+        planned = self._upsampler.plan(size_of(picture.rgb), size_of(picture.depth_lr))
+        self._expect_no_warning(pair, folder, picture.assumptions)
+        tell(picture.assumptions)
+        if wanted.dry_run:
+            tell(f"{pair.name}: {planned.text} -> {folder.path}")
+            return Done(pair, folder.path, "to do")
+        folder.expect_free(files_of(pair, request.reading).values())
+        read = time.perf_counter()
+        kept = folder.surface(picture.camera, errors=any(part.errors for part in wanted.of_frame))
+        if kept is None:
+            with progress.task("steps") as step:
+                surface = self._upsampler.upsample(picture.rgb, picture.depth_lr, picture.camera, step, sensor)
+            surface = as_stored(surface)
+            tell(_describe(surface, how))
+            surface = surface.without_dubious(wanted.max_error / 100) if wanted.certain else surface
+        else:
+            surface = kept._replace(filled=find_filled(kept.depth, picture.depth_lr))
+        result = Result(picture, surface, planned, wanted, readable(pair.name))
+        seconds = {"reading": read - begun, "upsampling": time.perf_counter() - read}
+        tell(folder.store(result, seconds, reused=kept is not None))
+        brief = [f"{planned.method} x{planned.scale}", *_in_brief(surface.noise, result.shares)]
+        brief += [f"{time.perf_counter() - begun:.1f} s", megabytes(folder.size)]
+        tell(f"{pair.name}: {', '.join(brief)} -> {folder.path}")
+        return Done(pair, folder.path, "done", folder.size)
+
+    def _folder(self, pair: Pair, target: Path) -> ResultFolder:
+        """Return the folder of a frame's results, with what these depend on."""
+        inputs = inputs_with_neighbours(self._request, pair, self._sequence.neighbours(pair))
+        return ResultFolder(target, inputs, self._request.settings, overwrite=self._request.results.overwrite)
+
+    def _is_done(self, folder: ResultFolder) -> bool:
+        return folder.is_done(self._request.results, checked=self._request.reading.strict)
+
+    def _is_to_do(self, pair: Pair, target: Path) -> bool:
+        """Return whether a frame is not complete; one that cannot be read is reported when its turn comes."""
+        try:
+            return not ((target / INFO).is_file() and self._is_done(self._folder(pair, target)))
+        except (ValueError, OSError):
+            return True
+
+    def _expect_no_warning(self, pair: Pair, folder: ResultFolder, notes: Sequence[Assumption]) -> None:
+        """Raise ValueError if one is a warning, and that is not allowed; with one line for all frames of a folder."""
+        if self._request.reading.strict:
+            several = folder.path != self._request.results.output
+            expect_no_warning(str(pair.depth.parent if several else pair.depth), notes, brief=several)
+
+    @functools.cached_property
+    def _upsampler(self) -> AnyRatio:
+        """The method, whose weights are loaded once."""
+        return self._request.upsampling.upsampler()
+
+    def _read(self, pair: Pair) -> Picture:
+        """Return a frame as it was read; the last ones are kept."""
+        if pair.name not in self._pictures:
+            with refusing_excess():
+                picture = read_picture(pair, self._request.reading, self._frames.units)
+                self._pictures[pair.name] = without_repeats(picture)
+        self._pictures.move_to_end(pair.name)
+        while len(self._pictures) > 1 and sum(each.rgb.numel() for each in self._pictures.values()) > self._kept:
+            self._pictures.popitem(last=False)
+        return self._pictures[pair.name]
+
+
+def _describe(surface: Surface, how: Upsampling) -> list[Assumption]:
+    """Return notes on an estimated noise of the input, on outliers, on what looks like glass, and on wide holes."""
+    notes, noise = [], surface.noise
+    if noise is not None and "noise" not in how.arguments:
+        text = f"about {show_length(noise.deviation, 2)}"
+        text += f", correlated over {noise.extent:.0f} pixels" if noise.extent > _WHITE else ""
+        text += f": worked on at 1/{noise.reduced}" if noise.reduced > 1 else ""
+        option = "--noise" if noise.reduced == 1 else "--working-size"
+        notes.append(Assumption("noise of the depth map", f"{text}; {option} overrides it"))
+    if surface.outliers is not None and surface.outliers.pixels:
+        text = "depth far from everything around it, or nearer than 5 cm, is treated as holes"
+        notes.append(Assumption(text, f"pixels: {surface.outliers.pixels}, patches: {surface.outliers.patches}"))
+    if surface.glass is not None and surface.glass >= _GLASS:
+        text = "photo and depth disagree as they do on glass, mirrors and gloss; do not trust the depth there"
+        of_pixels = f"{surface.glass:.1%} of the pixels, expected to be off by more than {NOTED:.0%}"
+        notes.append(Assumption(text, of_pixels))
+    share = float(surface.depth.isnan().float().mean())
+    if how.fill == "small" and share:
+        text = f"holes wider than {how.max_hole:g} degrees stay holes"
+        notes.append(Assumption(text, f"{share:.1%} of the pixels; --fill all fills them, too"))
+    return notes
+
+
+def _in_brief(noise: MapNoise | None, shares: Mapping[str, float]) -> list[str]:
+    """Return the noise of the input, the size that it was worked on at, and the shares of the pixels that are not 0.
+
+    A share is 0 % or 100 % only if it is exactly that.
+    """
+    brief = []
+    if noise is not None:
+        brief.append(f"noise {show_length(noise.deviation, 2)}")
+        if noise.reduced > 1:
+            brief.append(f"worked on at 1/{noise.reduced}")
+    words = {"open": "left open", "glass": "like glass"}
+    for name, share in shares.items():
+        if share:
+            percent = f"{min(max(round(100 * share, 1), 0.1), 99.9):g}%" if share < 1 else f"{share:.0%}"
+            brief.append(f"{words.get(name, name)} {percent}")
+    return brief

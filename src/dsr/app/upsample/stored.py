@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ import torch
 from dsr.app.upsample.parts import ERRORS, METRES, Part, Results
 from dsr.evaluation.results import load_errors
 from dsr.geometry.camera import Camera
-from dsr.inference import find_filled
+from dsr.inference.plausibility import find_filled
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import INPUT, read_input
 from dsr.io.frames import UPS
@@ -83,6 +83,15 @@ def read_result(folder: Path, name: str) -> ViewedResult:
         filled = find_filled(*(torch.from_numpy(each)[None] for each in (depth, depth_lr)))[0].numpy()
     except FileNotFoundError:
         notes.append(f"without {INPUT} there is neither the photo nor the input; the same `dsr upsample` again adds it")
+    near, middle, far = np.nanpercentile(depth, (1, 50, 99))
+    sizes = {name: " x ".join(map(str, info[f"{name}_size"])) or "unknown" for name in ("photo", "input")}
+    facts = {
+        "method": f"{info.get('method', 'unknown')} x{info.get('scale', '?')}",
+        **sizes,
+        "depth": f"{near:.2f} to {far:.2f} m, median {middle:.2f} m",
+    }
+    if info["noise"] is not None and is_number(info["noise"].get("deviation")):
+        facts["noise of the input"] = f"about {show_length(info['noise']['deviation'], 2)}"
     limit = info["settings"].get("max_error")
     return ViewedResult(
         name=name,
@@ -94,7 +103,7 @@ def read_result(folder: Path, name: str) -> ViewedResult:
         angle_error=angle_error,
         filled=filled,
         max_error=float(limit) if is_number(limit) and 0 < limit < 1e9 else Results.max_error / 100,
-        facts=_facts(info, depth),
+        facts=facts,
         notes=notes,
     )
 
@@ -190,23 +199,6 @@ def read_errors(folder: Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     return errors[0][0].numpy(), errors[1][0].numpy()
 
 
-def _facts(info: Mapping[str, Any], depth: np.ndarray) -> dict[str, str]:
-    """Return what is written below the surface."""
-    known = depth[np.isfinite(depth)]
-    near, middle, far = np.percentile(known, (1, 50, 99))
-    photo, given = (" x ".join(map(str, info[name])) or "unknown" for name in ("photo_size", "input_size"))
-    facts = {
-        "method": f"{info.get('method', 'unknown')} x{info.get('scale', '?')}",
-        "photo": photo,
-        "input": given,
-        "depth": f"{near:.2f} to {far:.2f} m, median {middle:.2f} m",
-    }
-    noise = info["noise"]
-    if noise is not None and is_number(noise.get("deviation")):
-        facts["noise of the input"] = f"about {show_length(noise['deviation'], 2)}"
-    return facts
-
-
 def read_frame(name: str, folder: Path) -> Frame:
     """Return the frame whose results are in a folder; a ValueError if they are not complete.
 
@@ -220,20 +212,16 @@ def read_frame(name: str, folder: Path) -> Frame:
     return Frame(name, read_camera(folder, info), pose, colour, depth, read_up(info), time if is_number(time) else None)
 
 
-class SceneResult(NamedTuple):
-    """What was written, by part, and the problems, one line each."""
+def write_scene(
+    output: Path, folders: Mapping[str, Path], parts: Sequence[Part], *, overwrite: bool
+) -> tuple[dict[str, Path], list[str]]:
+    """Write exports of frames that are complete; return them by part, and the problems, one line each.
 
-    files: dict[str, Path]
-    problems: list[str]
-
-
-def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[Part], *, overwrite: bool) -> SceneResult:
-    """Write exports of frames that are complete, and record them in ``exports.json``.
-
-    A problem with one export does not stop the others. ``folders`` are those of the frames, by their names; with
-    ``overwrite`` what is there and not recorded is replaced.
+    They are recorded in ``exports.json``. A problem with one export does not stop the others. ``folders`` are those of
+    the frames, by their names; with ``overwrite`` what is there and not recorded is replaced.
     """
-    result = SceneResult({}, [])
+    written: dict[str, Path] = {}
+    problems: list[str] = []
     try:
         frames = [read_frame(name, folder) for name, folder in folders.items()]
         names: dict[str, str] = {}
@@ -244,18 +232,17 @@ def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[Part]
             names[frame.stem] = frame.name
         recorded = read_exports(output)
     except (ValueError, OSError) as error:
-        result.problems.append(str(error))
-        return result
+        return written, [str(error)]
     for part in parts:
         name = part.files[0]
         there = [output / each for each in part.files if (output / each).exists()]
         if there and name not in recorded and not overwrite:
-            result.problems.append(f"{there[0]}: is there already and not of an earlier run; --overwrite replaces it")
+            problems.append(f"{there[0]}: is there already and not of an earlier run; --overwrite replaces it")
             continue
         try:
             paths = _EXPORTERS[part.name](output / name, frames)
         except (ValueError, OSError) as error:
-            result.problems.append(str(error))
+            problems.append(str(error))
             continue
         files = sorted(path.relative_to(output).as_posix() for path in paths)
         for old in set(recorded.get(name, ())) - set(files):  # of frames that are no longer there
@@ -263,8 +250,8 @@ def write_scene(output: Path, folders: Mapping[str, Path], parts: Sequence[Part]
                 (output / old).unlink(missing_ok=True)
         recorded[name] = files
         write_text(output / EXPORTS, json.dumps({"exports": recorded}, indent=2) + "\n")
-        result.files[part.name] = output / name
-    return result
+        written[part.name] = output / name
+    return written, problems
 
 
 _EXPORTERS = {

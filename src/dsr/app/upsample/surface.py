@@ -18,12 +18,12 @@ from torch import Tensor
 
 from dsr.app.upsample.outputs import Result, ResultFolder
 from dsr.app.upsample.parts import Results
-from dsr.app.upsample.stored import read_complete, write_scene
+from dsr.app.upsample.stored import write_scene
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import FIGURE_LIGHT, Direction, direction_of
 from dsr.geometry.mesh import Mesh, triangulate, vertex_normals
 from dsr.geometry.surface import render_for_viewing, shade
-from dsr.inference import Plan
+from dsr.inference.resizing import Plan
 from dsr.io.exports import normal_strips
 from dsr.io.files import python_messages
 from dsr.io.inputs import Picture
@@ -84,19 +84,16 @@ class Surface(Generic[Array]):
     @property
     def depth_error(self) -> Array:
         """The absolute error of the depth that is to be expected at each pixel, in metres."""
-        assert self._found.depth_error is not None  # noqa: S101 - it is estimated for methods that do not say it
         return self._give(self._found.depth_error)
 
     @property
     def angle_error(self) -> Array:
         """The angle between the normal and the true one that is to be expected at each pixel, in degrees."""
-        assert self._found.angle_error is not None  # noqa: S101 - as above
         return self._give(self._found.angle_error)
 
     @property
     def filled(self) -> Array:
         """Where there is depth that was not measured, bool."""
-        assert self._found.filled is not None  # noqa: S101 - it is there in each result of AnyRatio
         return self._give(self._found.filled)
 
     @property
@@ -203,30 +200,32 @@ class Surface(Generic[Array]):
         with python_messages():
             if unknown := sorted(options.keys() - set(_OPTIONS)):
                 raise ValueError(f"save: expected some of {', '.join(_OPTIONS)}, got {', '.join(unknown)}")
-            only = None if parts is None else tuple(parts)
-            return self._save(Results(output=Path(folder), only=only, **options))
-
-    def _save(self, wanted: Results) -> list[Path]:
-        """Write results, and return the files."""
-        content = hashlib.sha256(self._found.depth.numpy().tobytes() + _bytes(self._picture.rgb).tobytes())
-        inputs = {"surface": {"sha256": content.hexdigest()}}  # which a folder of results has for its inputs
-        path, limit = wanted.output, wanted.max_error / 100
-        folder = ResultFolder(path, inputs, {"max_error": limit}, overwrite=wanted.overwrite)
-        folder.expect_agreement("take another folder, or overwrite=True")
-        folder.expect_free()
-        found = self._found.without_dubious(limit) if wanted.certain else self._found
-        stored = folder.store(Result(self._picture, found, self._plan, wanted), {"upsampling": self._seconds})
-        warn(note for note in stored.notes if note.code)
-        files = [path / name for name in read_complete(path)["files"]]
-        if not wanted.of_all:
+            wanted = Results(output=Path(folder), only=None if parts is None else tuple(parts), **options)
+            content = hashlib.sha256(self._found.depth.numpy().tobytes() + _bytes(self._picture.rgb).tobytes())
+            inputs = {"surface": {"sha256": content.hexdigest()}}  # which a folder of results has for its inputs
+            path, limit = wanted.output, wanted.max_error / 100
+            results = ResultFolder(path, inputs, {"max_error": limit}, overwrite=wanted.overwrite)
+            results.expect_agreement("take another folder, or overwrite=True")
+            results.expect_free()
+            found = self._found.without_dubious(limit) if wanted.certain else self._found
+            notes = results.store(Result(self._picture, found, self._plan, wanted), {"upsampling": self._seconds})
+            warn(note for note in notes if note.code)
+            files = [path / name for name in results.earlier["files"]]
+            if wanted.of_all:
+                exports, problems = write_scene(path, {path.name: path}, wanted.of_all, overwrite=wanted.overwrite)
+                if problems:
+                    raise ValueError(problems[0])
+                files += exports.values()
             return files
-        scene = write_scene(path, {path.name: path}, wanted.of_all, overwrite=wanted.overwrite)
-        if scene.problems:
-            raise ValueError(scene.problems[0])
-        return files + list(scene.files.values())
 
     def __repr__(self) -> str:
-        return f"Surface({self._size(self._found.depth)}, {self._range}, {self._plan.method} x{self._plan.scale})"
+        size = f"{self.camera.width} x {self.camera.height}"
+        return f"Surface({size}, {self._range()}, {self._plan.method} x{self._plan.scale})"
+
+    def _range(self) -> str:
+        """Return the nearest and the farthest depth."""
+        known = self._found.depth[self._found.depth.isfinite()]
+        return f"{known.min():.3g} to {known.max():.3g} m" if len(known) else "nothing known"
 
     def _repr_html_(self) -> str:
         """Return the photo, the depth map that was given, and the surface, both under a light, for a notebook."""
@@ -237,8 +236,9 @@ class Surface(Generic[Array]):
         ]
         content = encode_row([self._picture.rgb.permute(1, 2, 0).numpy(), *tones])
         error = float(self._found.depth_error.nanmedian()) if self._found.depth_error is not None else float("nan")
+        size = f"{self.camera.width} x {self.camera.height}"
         about = (
-            f"photo; depth as given, {self._size(before)}; surface, {self._size(self._found.depth)}: {self._range}, "
+            f"photo; depth as given, {view.width} x {view.height}; surface, {size}: {self._range()}, "
             f"&plusmn; {1e3 * error:.2g} mm (median), by {escape(self._plan.method)}"
         )
         about += "; pink: holes" if bool(before.isnan().any() or self._found.depth.isnan().any()) else ""
@@ -253,16 +253,6 @@ class Surface(Generic[Array]):
         """The normals, (3, H, W)."""
         return _normals(self._found.depth, self.camera)
 
-    @property
-    def _range(self) -> str:
-        """The nearest and the farthest depth."""
-        known = self._found.depth[self._found.depth.isfinite()]
-        return f"{known.min():.3g} to {known.max():.3g} m" if len(known) else "nothing known"
-
-    @staticmethod
-    def _size(depth: Tensor) -> str:
-        return f"{depth.shape[-1]} x {depth.shape[-2]}"
-
     def _certain(self, max_error: float | None) -> Tensor:
         """Return the depth, (1, H, W), without pixels that are likely to be wrong."""
         if max_error is None:
@@ -276,8 +266,9 @@ class Surface(Generic[Array]):
         """Return the photo's colours at the vertices, (N, 3) uint8."""
         return _bytes(self._picture.rgb.flatten(1)[:, torch.from_numpy(mesh.pixels)]).T
 
-    def _give(self, values: Tensor) -> Array:
+    def _give(self, values: Tensor | None) -> Array:
         """Return a map, (1, H, W), as the depth map was given."""
+        assert values is not None  # noqa: S101 - AnyRatio estimates what a method does not say
         return cast("Array", values[0].numpy().copy() if self._device is None else values.to(self._device, copy=True))
 
 
