@@ -20,7 +20,7 @@ from small_files import written
 from dsr.app.entry import run_command, run_eval, run_train
 from dsr.app.schema import EvalConfig, plain_config
 from dsr.cli import main
-from dsr.report.study.key import write_key
+from dsr.report.study.files import write_key
 from dsr.report.study.percentages import COLUMNS
 from dsr.training.module import SuperResolution
 from dsr.utils.configuration import config_directories

@@ -10,7 +10,7 @@ import pytest
 from dsr.cli import main
 from dsr.evaluation.run_files import load_results
 from dsr.report.study import Choice
-from dsr.report.study.key import read_key
+from dsr.report.study.files import read_key
 from dsr.report.study.questionnaire import build_study
 
 LABELS = {"msg_v": "MSG-V", "bicubic": "Bicubic", "dip": "DIP"}

@@ -10,7 +10,7 @@ import pytest
 
 from dsr.evaluation.run_files import load_results, read_run
 from dsr.report.correlation_figure import save_scatter_matrix
-from dsr.report.study.study_table import PERCENTAGES, read_study
+from dsr.report.study.percentages import PERCENTAGES, read_study
 from dsr.report.table_layouts import escaped, latex_text, to_csv, to_latex, to_markdown
 from dsr.report.tables import build_tables
 

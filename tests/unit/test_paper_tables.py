@@ -11,7 +11,7 @@ import pytest
 from dsr.evaluation.results import Results, Run
 from dsr.metrics.formats import MetricFormat
 from dsr.report.paper import PAPER_SCENES, Place, published, sets_of_dataset, sets_of_summary
-from dsr.report.study.study_table import read_study
+from dsr.report.study.percentages import read_study
 from dsr.report.table_layouts import to_markdown
 from dsr.report.tables import build_tables
 

@@ -21,8 +21,7 @@ from dsr.geometry.camera import Camera
 from dsr.pictures.depth_views import rendering
 from dsr.report.significance import agreement, average_fraction, bootstrap_of_average, wilson
 from dsr.report.study import Choice
-from dsr.report.study.answers import files_of, read_all, read_answers
-from dsr.report.study.key import Candidate, Key, Trial, read_key, write_key
+from dsr.report.study.files import Candidate, Key, Trial, files_of, read_all, read_answers, read_key, write_key
 from dsr.report.study.percentages import ALL, AVERAGE, COLUMNS, collect, remarks
 from dsr.report.study.questionnaire import build_study, grey_png
 

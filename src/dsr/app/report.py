@@ -15,7 +15,7 @@ from dsr.report.correlation_figure import save_scatter_matrix
 from dsr.report.correlations import write_correlations
 from dsr.report.figures import Figures
 from dsr.report.page import Pictures, save_page
-from dsr.report.study.study_table import read_study
+from dsr.report.study.percentages import read_study
 from dsr.report.table_layouts import write_tables
 from dsr.report.worker_pool import WorkerPool, default_workers
 from dsr.utils.console import ConsoleProgress, show

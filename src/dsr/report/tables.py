@@ -45,7 +45,7 @@ from dsr.report.paper import (
     sets_of_summary,
 )  # fmt: skip
 from dsr.report.significance import LEAST, LEVEL, interval_of_mean, p_of_difference
-from dsr.report.study.study_table import PERCENTAGES, check_study, study_cells
+from dsr.report.study.percentages import PERCENTAGES, check_study, study_cells
 
 
 @dataclass(frozen=True)
