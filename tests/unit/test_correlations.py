@@ -9,9 +9,8 @@ import pytest
 from scipy import stats
 
 from dsr.evaluation.results import Results, Run
-from dsr.report import correlation_figure
-from dsr.report.correlation_figure import save_scatter_matrix
-from dsr.report.correlations import correlate, metric_matrix, with_reference, write_correlations
+from dsr.report import correlations
+from dsr.report.correlations import correlate, metric_matrix, save_scatter_matrix, with_reference, write_correlations
 from dsr.report.paper import published
 
 VARIANTS = ("e1", "e2", "e3", "e4", "max", "avg")
@@ -102,7 +101,7 @@ def test_missing_lpips_leaves_the_rest_and_one_line_says_so(tmp_path, monkeypatc
     text = write_correlations(tmp_path, results)[-1].read_text(encoding="utf-8")
     assert "There is no LPIPS_v in these 5 results" in text
     drawn = {}
-    monkeypatch.setattr(correlation_figure, "write_figure", lambda path, figure, *_: drawn.update({path.name: figure}))
+    monkeypatch.setattr(correlations, "write_figure", lambda path, figure, *_: drawn.update({path.name: figure}))
     save_scatter_matrix(results, tmp_path)
     assert list(drawn) == ["scatter_matrix.pdf", "scatter_matrix.png"]
     assert "no LPIPS_v in these results" in drawn["scatter_matrix.pdf"].texts[0].get_text()

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from dsr.evaluation.run_files import load_results, read_run
-from dsr.report.correlation_figure import save_scatter_matrix
+from dsr.report.correlations import save_scatter_matrix
 from dsr.report.study.percentages import PERCENTAGES, read_study
 from dsr.report.table_layouts import escaped, latex_text, to_csv, to_latex, to_markdown
 from dsr.report.tables import build_tables

@@ -11,8 +11,7 @@ from rich.console import Console
 from dsr.app.requests import REPORT_PARTS, LeaderboardRequest, ReportRequest
 from dsr.evaluation.run_files import load_results
 from dsr.notes import expect_no_warning
-from dsr.report.correlation_figure import save_scatter_matrix
-from dsr.report.correlations import write_correlations
+from dsr.report.correlations import save_scatter_matrix, write_correlations
 from dsr.report.figures import Figures
 from dsr.report.page import Pictures, save_page
 from dsr.report.study.percentages import read_study
