@@ -8,7 +8,7 @@ import pytest
 
 from dsr.evaluation.results import Results, Run
 from dsr.metrics.formats import MetricFormat
-from dsr.report.page.content import standings
+from dsr.report.page import standings
 
 FORMATS = {
     "RMSE_d": MetricFormat("RMSE_d", "mm", 1e3, 1, position=1),

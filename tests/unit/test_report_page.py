@@ -18,7 +18,7 @@ from dsr.evaluation.run_files import load_results
 from dsr.geometry.surface import render
 from dsr.pictures.depth_views import normals_seen_by
 from dsr.report.page import Pictures, save_page
-from dsr.report.page.scene_content import PictureStore, depth_picture, error_picture, mask_picture
+from dsr.report.page_scenes import PictureStore
 from dsr.report.worker_pool import WorkerPool
 
 
@@ -91,20 +91,6 @@ def test_stored_errors_are_result_minus_truth_within_a_hundredth_of_the_largest(
     found = np.sign(levels) * levels**2 / 127**2 * largest
     assert np.abs(found - expected.clip(-largest, largest)).max() <= 0.01 * largest
     assert largest == pytest.approx(np.percentile(np.abs(expected), 99.9))
-
-
-@pytest.mark.parametrize(("error", "level"), [(0, 128), (2, 255), (-2, 1), (9, 255), (0.5, 192), (-0.5, 64)])
-def test_error_is_stored_by_the_root_of_its_fraction_of_the_largest(error, level):
-    assert error_picture(np.array([[float(error)]]), 2.0)[0, 0] == pytest.approx(level, abs=1)
-
-
-def test_depth_is_stored_between_its_limits():
-    assert depth_picture(np.array([[0.5, 1, 2, 3, 9.0]]), 1, 3).tolist() == [[0, 0, 128, 255, 255]]
-
-
-def test_mask_distinguishes_a_hole_from_a_depth_without_a_normal():
-    depth, normal = np.array([[False, True, True]]), np.array([[False, False, True]])
-    assert mask_picture(depth, normal)[..., 0].tolist() == [[0, 128, 255]]
 
 
 def test_holes_of_a_result_are_masked_and_their_neighbours_have_no_normal(make_run, tmp_path):
