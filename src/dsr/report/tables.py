@@ -194,12 +194,12 @@ def build_tables(results: Results, study: pd.DataFrame | None = None, *, interva
                 heading = f"{heading}, x{scale}, {downsampling} downsampling"
                 table = _table(heading, runs, groups, formats)
                 if paper or table.columns:
-                    tables.append(replace(table, name=_unique(f"{stem}_x{scale}_{downsampling}", names)))
+                    tables.append(replace(table, name=unique_name(f"{stem}_x{scale}_{downsampling}", names)))
     return tables
 
 
-def _unique(stem: str, taken: set[str]) -> str:
-    """Return a name that is unique on any file system."""
+def unique_name(stem: str, taken: set[str]) -> str:
+    """Return a file name that no other one of them equals on any file system, and add it to them."""
     slug = re.sub(r"[^A-Za-z0-9.-]+", "_", stem).strip("._-")
     name, number = slug, 2
     while name.casefold() in taken:
