@@ -96,12 +96,56 @@ class Canvas:
         self._pictures.add_patch(Rectangle(place.p0, place.width, place.height, label=label, **style))
 
 
-def fitted(space: Bbox, aspect: float) -> Bbox:
-    """Return the largest rectangle of a ratio of height to width in the middle of a space."""
-    width = min(space.width, space.height / aspect)
-    height = width * aspect
-    left, bottom = (space.x0 + space.x1 - width) / 2, (space.y0 + space.y1 - height) / 2
-    return Bbox.from_bounds(left, bottom, width, height)
+class Panels(Canvas):
+    """Rows of panels, in the middle of which stand pictures of one ratio of height to width.
+
+    Args:
+        shape: number of rows and columns.
+        aspect: of the pictures; the panels are at least 0.4 and at most 2.5 times as high as wide.
+        width: of a panel, inches, as are the following.
+        gap: left and right of each panel.
+        space: above the first row, between rows, and below the last one.
+
+    """
+
+    def __init__(
+        self, shape: tuple[int, int], aspect: float, width: float, gap: float, space: tuple[float, float, float]
+    ) -> None:
+        rows, columns = shape
+        self._aspect, self._width, self._gap, (self._above, self._between, below) = aspect, width, gap, space
+        self._height = width * min(max(aspect, 0.4), 2.5)
+        height = self._above + rows * self._height + (rows - 1) * self._between + below
+        super().__init__(columns * width + (columns + 1) * gap, height)
+
+    def space(self, row: int, column: int) -> Bbox:
+        """Return the space of a panel."""
+        top = self.figure.get_figheight() - self._above - row * (self._height + self._between)
+        left = self._gap + column * (self._width + self._gap)
+        return Bbox.from_bounds(left, top - self._height, self._width, self._height)
+
+    def place(self, row: int, column: int) -> Bbox:
+        """Return where the picture of a panel is."""
+        space = self.space(row, column)
+        width = min(space.width, space.height / self._aspect)
+        height = width * self._aspect
+        left, bottom = (space.x0 + space.x1 - width) / 2, (space.y0 + space.y1 - height) / 2
+        return Bbox.from_bounds(left, bottom, width, height)
+
+    def panel(self, row: int, column: int, picture: np.ndarray, title: str, **style: Any) -> AxesImage:
+        """Draw a picture below its title."""
+        place = self.place(row, column)
+        self.text((place.x0 + place.x1) / 2, place.y1 + 0.08, title, fontsize=12, ha="center")
+        return self.show(place, picture, **{"interpolation": "nearest", **style})
+
+    def bar_below(
+        self, image: AxesImage, row: int, columns: tuple[int, int], label: str, extend: str, height: float = 0.09
+    ) -> None:
+        """Draw a colour bar below the panels from one column to another."""
+        left, right = self.space(row, columns[0]).x0, self.space(row, columns[1]).x1
+        width = min(right - left, 1.6 * self._width) - 0.2 * self._width
+        below = self.place(row, columns[1]).y0
+        place = Bbox.from_bounds((left + right - width) / 2, below - 0.1 - height, width, height)
+        self.bar(image, place, extend=extend, orientation="horizontal").set_label(label, labelpad=1)
 
 
 @contextlib.contextmanager

@@ -378,7 +378,7 @@ def _before_after(folder: Path, result: Result) -> None:
 
 
 def _confidence(folder: Path, result: Result) -> Output | None:
-    from dsr.pictures.expected_errors import write_confidence  # noqa: PLC0415 - as above
+    from dsr.pictures.panels import write_confidence  # noqa: PLC0415 - as above
 
     surface = result.surface
     if surface.depth_error is None or surface.angle_error is None:
