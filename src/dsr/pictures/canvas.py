@@ -7,7 +7,7 @@ import gc
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import matplotlib as mpl
@@ -32,6 +32,21 @@ _PNG_LEVEL = 6
 _HEIGHT, _WIDTH, _GAP = 220, 320, 6
 """Pixels: the panels' largest size, and what lies between them."""
 _QUALITY = 85
+
+
+class Part(NamedTuple):
+    """A rectangle of a picture in relative coordinates: 0 is the left or upper edge, 1 the right or lower edge."""
+
+    left: float
+    right: float
+    top: float
+    bottom: float
+
+    def of(self, place: Bbox) -> Bbox:
+        """Return where the part is of a picture that is drawn at a place."""
+        x0, x1 = (place.x0 + at * place.width for at in (self.left, self.right))
+        y1, y0 = (place.y1 - at * place.height for at in (self.top, self.bottom))
+        return Bbox.from_extents(x0, y0, x1, y1)
 
 
 def colours(name: str | Colormap) -> Any:
@@ -101,26 +116,30 @@ class Panels(Canvas):
 
     Args:
         shape: number of rows and columns.
-        aspect: of the pictures; the panels are at least 0.4 and at most 2.5 times as high as wide.
-        width: of a panel, inches, as are the following.
-        gap: left and right of each panel.
-        space: above the first row, between rows, and below the last one.
+        aspect: of the pictures.
+        size: width and height of a panel, inches, as are the following.
+        across: left of the first column, and right of each one.
+        down: above the first row, between rows, and below the last one.
 
     """
 
     def __init__(
-        self, shape: tuple[int, int], aspect: float, width: float, gap: float, space: tuple[float, float, float]
+        self,
+        shape: tuple[int, int],
+        aspect: float,
+        size: tuple[float, float],
+        across: tuple[float, float],
+        down: tuple[float, float, float],
     ) -> None:
-        rows, columns = shape
-        self._aspect, self._width, self._gap, (self._above, self._between, below) = aspect, width, gap, space
-        self._height = width * min(max(aspect, 0.4), 2.5)
+        (rows, columns), self._aspect, (self._width, self._height) = shape, aspect, size
+        (self._left, self._gap), (self._above, self._between, below) = across, down
         height = self._above + rows * self._height + (rows - 1) * self._between + below
-        super().__init__(columns * width + (columns + 1) * gap, height)
+        super().__init__(self._left + columns * (self._width + self._gap), height)
 
     def space(self, row: int, column: int) -> Bbox:
         """Return the space of a panel."""
         top = self.figure.get_figheight() - self._above - row * (self._height + self._between)
-        left = self._gap + column * (self._width + self._gap)
+        left = self._left + column * (self._width + self._gap)
         return Bbox.from_bounds(left, top - self._height, self._width, self._height)
 
     def place(self, row: int, column: int) -> Bbox:
@@ -215,11 +234,15 @@ def encode_row(panels: Sequence[np.ndarray]) -> bytes:
     return content.tobytes()
 
 
+def with_holes(picture: np.ndarray) -> np.ndarray:
+    """Return an (H, W, 3) picture with the pixels that are not finite in the hole colour."""
+    known = np.isfinite(picture).all(axis=2, keepdims=True)
+    return np.where(known, picture, colours("gray").get_bad()[:3])
+
+
 def _resized(panel: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Return a panel as RGBA of a width and height."""
-    colour = np.repeat(panel[..., None], 3, axis=2) if panel.ndim == 2 else panel
-    holes = ~np.isfinite(colour).all(axis=2, keepdims=True)
-    pixels: Any = np.where(holes, colours("gray").get_bad()[:3], colour).astype(np.float32)
+    pixels: Any = with_holes(np.repeat(panel[..., None], 3, axis=2) if panel.ndim == 2 else panel).astype(np.float32)
     smaller = size[0] < pixels.shape[1]
     pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_NEAREST)
     known = np.full((size[1], size[0], 1), 255, np.uint8)

@@ -32,7 +32,8 @@ def save_picture(
     """Draw a scene's result, (1, H, W) in metres, with its worst-of-four scores in raw units; write it atomically."""
     truth = sample.depth
     height, width = depth.shape[-2:]
-    page = Panels((2 if truth is None else 3, 5), height / width, 3.2, 0.1, (0.8, 0.95, 0.95))
+    panel = 3.2, 3.2 * min(max(height / width, 0.4), 2.5)
+    page = Panels((2 if truth is None else 3, 5), height / width, panel, (0.1, 0.1), (0.8, 0.95, 0.95))
     maps = [(sample.depth_lr, f"input, {sample.camera_lr.width} x {sample.camera_lr.height}"), (depth, label)]
     if truth is not None:
         maps.append((truth, "truth"))
@@ -87,7 +88,8 @@ def write_confidence(
     valid = depth[depth.isfinite()]
     middle = 1e3 * float(valid.median()) if valid.numel() else 1e3
     limits = ((1e-3 * middle, 0.1 * middle), _DEGREES)
-    page = Panels((len(rows), 2), depth.shape[-2] / depth.shape[-1], 4.6, 0.4, (0.4, 1.15, 0.75))
+    aspect = depth.shape[-2] / depth.shape[-1]
+    page = Panels((len(rows), 2), aspect, (4.6, 4.6 * min(max(aspect, 0.4), 2.5)), (0.4, 0.4), (0.4, 1.15, 0.75))
     for row, (kind, maps) in enumerate(zip(("expected", "measured"), rows, strict=False)):
         for column, (what, unit) in enumerate((("depth", "mm"), ("normal", "degrees"))):
             low, high = limits[column]
