@@ -201,7 +201,11 @@ def _distinguish(runs: Sequence[Run]) -> list[Run]:
 
     Examples: "MSG-V (ensemble=1)", "middlebury (size=256)".
     """
-    methods = [_identity_of_method(run.settings) for run in runs]
+    methods = [method_settings(run.settings) | {"alignment": run.settings.get("alignment")} for run in runs]
+    for found, run in zip(methods, runs, strict=True):
+        for key, name in (("weights_sha256", "weights"), ("precision", "precision")):
+            if run.settings.get(key) is not None:
+                found[name] = str(run.settings[key])[:_DIGEST]
     datasets = [{**run.settings.get("dataset", {}), "root": None, "scenes": None, "_target_": None} for run in runs]
     labels = _distinguishing_suffixes([(run.label, run.scale) for run in runs], methods)
     names = _distinguishing_suffixes([(run.dataset, 0) for run in runs], datasets)
@@ -241,15 +245,6 @@ def _by_truth(runs: Sequence[Run]) -> list[Run]:
         else run
         for run in runs
     ]
-
-
-def _identity_of_method(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings that distinguish methods of one label: parameters, weights, precision, alignment."""
-    found = method_settings(settings) | {"alignment": settings.get("alignment")}
-    for key, name in (("weights_sha256", "weights"), ("precision", "precision")):
-        if settings.get(key) is not None:
-            found[name] = str(settings[key])[:_DIGEST]
-    return found
 
 
 def _distinguishing_suffixes(names: Sequence[Any], settings: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.evaluation.results import BenchmarkSetting, Results, Run, one_per_method
+from dsr.evaluation.results import BenchmarkSetting, Results, Run
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import BASIS
 from dsr.geometry.surface import normal_mask, shade
@@ -82,7 +82,7 @@ Encoded = tuple[dict[str, Any] | None, PictureStore, list[str]]
 def encode_scene(longest: int, results: Results, place: tuple[BenchmarkSetting, str]) -> Encoded:
     """Return the data of a scene of a setting for the page, with pictures of at most ``longest`` pixels."""
     problem, scene = place
-    view = View(problem, scene, one_per_method(results.by_scene(problem)[scene]))
+    view = next(view for view in views_of(results, problem) if view.scene == scene)
     pool, notes = PictureStore(longest), list[str]()
     stored = stored_sample(view, notes)
     return None if stored is None else _scene_data(view, stored, pool, notes), pool, notes

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from dsr.evaluation.results import BenchmarkSetting, Results, Run, one_per_method
+from dsr.evaluation.results import BenchmarkSetting, Results, Run
 from dsr.sample import DepthSample
 
 
@@ -35,7 +35,12 @@ class Result:
 
 def views_of(results: Results, problem: BenchmarkSetting) -> list[View]:
     """Return the scenes of a setting that have predictions."""
-    return [View(problem, scene, one_per_method(runs)) for scene, runs in results.by_scene(problem).items()]
+    found: dict[str, dict[str, Run]] = {}
+    for run in results.of(problem):
+        for scene in run.scenes:
+            lowest = found.setdefault(scene, {})
+            lowest[run.label] = min(lowest.get(run.label, run), run, key=lambda each: each.seed)
+    return [View(problem, scene, tuple(runs.values())) for scene, runs in found.items()]
 
 
 def stored_sample(view: View, notes: list[str]) -> DepthSample | None:

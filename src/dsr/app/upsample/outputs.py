@@ -369,7 +369,7 @@ def _fewer(part: str, what: str, option: str, shape: Written) -> list[Assumption
 
 
 def _before_after(folder: Path, result: Result) -> None:
-    from dsr.pictures.before_after import write_before_after  # noqa: PLC0415 - Matplotlib, which takes a second
+    from dsr.pictures.panels import write_before_after  # noqa: PLC0415 - Matplotlib, which takes a second
 
     picture, plan = result.picture, result.plan
     title = ", ".join(filter(None, (result.name, f"{plan.method} x{plan.scale}")))
