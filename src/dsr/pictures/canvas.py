@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import gc
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -165,18 +163,6 @@ class Panels(Canvas):
         below = self.place(row, columns[1]).y0
         place = Bbox.from_bounds((left + right - width) / 2, below - 0.1 - height, width, height)
         self.bar(image, place, extend=extend, orientation="horizontal").set_label(label, labelpad=1)
-
-
-@contextlib.contextmanager
-def without_collections() -> Iterator[None]:
-    """Leave garbage alone within the context: Matplotlib makes so many objects that to go through them takes long."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 def save_both(folder: Path, name: str, figure: Figure) -> list[Path]:

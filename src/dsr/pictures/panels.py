@@ -19,7 +19,7 @@ from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.surface import render, render_for_viewing
 from dsr.io.exports import normal_strips
 from dsr.metrics.formats import Formats, describe_directions, in_tables
-from dsr.pictures.canvas import Canvas, Panels, Part, with_holes, without_collections, write_figure
+from dsr.pictures.canvas import Canvas, Panels, Part, with_holes, write_figure
 from dsr.pictures.depth_views import angles_between, limits_of, normals_seen_by, reduced, strongest_window
 from dsr.sample import DepthSample
 from dsr.utils.ratios import round_ratio
@@ -46,7 +46,6 @@ _ROWS = ("lit from above", "detail", "normals | depth")
 _WHOLE = Part(0, 1, 0, 1)
 
 
-@without_collections()
 def save_picture(
     path: Path, sample: DepthSample, depth: Tensor, scores: Mapping[str, float], label: str, formats: Formats
 ) -> None:
@@ -90,7 +89,6 @@ def save_picture(
     write_figure(path, page.figure, _DPI)
 
 
-@without_collections()
 def write_confidence(
     path: Path,
     depth: Tensor,
@@ -121,7 +119,6 @@ def write_confidence(
     write_figure(path, page.figure, _DPI, few_colours=True)
 
 
-@without_collections()
 def write_before_after(path: Path, rgb: Tensor, depth_lr: Tensor, depth: Tensor, camera: Camera, title: str) -> None:
     """Draw the photo, the input and the result, both as a surface lit from above and as depth.
 

@@ -55,7 +55,7 @@ class Figures:
         self.notes: list[str] = []
         """One line per scene or result that could not be drawn."""
         self._pages = [*pages_of(workers.results, KINDS, light, self.notes), None]
-        self._drawn = workers.map(functools.partial(_draw, folder), self._pages)
+        self._drawn = workers.map(functools.partial(draw_page, folder), self._pages)
 
     def save(self, progress: Callable[[int, int, str], None] | None = None) -> list[Path]:
         """Return the files once they are drawn; ``progress`` is told the number done, of all, and the figure's name."""
@@ -67,15 +67,6 @@ class Figures:
             paths += files
             self.notes += [note for note in notes if note not in self.notes]
         return paths
-
-
-def _draw(folder: Path, results: Results, page: Page | None) -> tuple[list[Path], list[str]]:
-    """Draw a page, or the figure of the lights for None; return the files and notes on what could not be drawn."""
-    notes: list[str] = []
-    paths = (
-        save_lights_figure(folder, _most_varied(results)) if page is None else save_page(folder, results, page, notes)
-    )
-    return paths, notes
 
 
 @dataclass(frozen=True)
@@ -113,8 +104,11 @@ def pages_of(results: Results, kinds: Iterable[str], light: str, notes: list[str
     return found
 
 
-def save_page(folder: Path, results: Results, page: Page, notes: list[str]) -> list[Path]:
-    """Draw a page, unless none of its scenes can be drawn, and return its PDF and PNG; ``notes`` takes the reasons."""
+def draw_page(folder: Path, results: Results, page: Page | None) -> tuple[list[Path], list[str]]:
+    """Draw a page, or the figure of the lights for None; return its PDF and PNG, and notes on what cannot be drawn."""
+    notes: list[str] = []
+    if page is None:
+        return save_lights_figure(folder, _most_varied(results)), notes
     make_row, below = _GRIDS[page.kind]
     methods = list(dict.fromkeys(run.label for run in results.of(page.problem)))
     rows = []
@@ -124,12 +118,12 @@ def save_page(folder: Path, results: Results, page: Page, notes: list[str]) -> l
         if row is not None:
             rows.append(row)
     if not rows:
-        return []
+        return [], notes
     columns = ["photo", *methods] if page.kind == "errors" else ["photo", "input", *methods, "truth"]
     title = f"{page.problem.dataset}, x{page.problem.scale}, {page.problem.downsampling}"
     pictures = (cell.picture for row in rows for cell in row.cells if cell.picture is not None)
     holes = "; pink: holes" if any(not np.isfinite(picture).all() for picture in pictures) else ""
-    return save_both(folder, page.name, draw_grid(columns, rows, (title, below.format(page.light) + holes)))
+    return save_both(folder, page.name, draw_grid(columns, rows, (title, below.format(page.light) + holes))), notes
 
 
 def rendering_row(shown: Shown, light: str) -> Row:

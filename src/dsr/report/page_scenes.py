@@ -169,12 +169,11 @@ def _expected(
     """Store the expected errors, (1, H, W) in metres and degrees, where the depth and its normals are known."""
     known = depth.isfinite()
     normals_known = normal_mask(known) if min(known.shape[-2:]) > 1 else torch.zeros_like(known)
-    stored, valid = {}, []
+    stored, valid = {}, {}
     for name, error, there in (("depth", errors[0], known), ("angle", errors[1], normals_known)):
-        values, fitted = pool.fit(torch.where(there, error, torch.nan))
+        values, valid[name] = pool.fit(torch.where(there, error, torch.nan))
         stored[name] = pool.add(np.rint(255 * np.sqrt(np.clip(values / largest[name], 0, 1))).astype(np.uint8))
-        valid.append(fitted)
-    return stored | _mask(*valid, pool)
+    return stored | _mask(valid["depth"], valid["angle"], pool)
 
 
 def _error_limits(differences: Sequence[Tensor]) -> tuple[float, dict[str, float]]:

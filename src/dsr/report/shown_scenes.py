@@ -101,9 +101,4 @@ def shown_of(view: View, methods: Sequence[str], notes: list[str]) -> Shown | No
         return None
     depths = {each.run.label: each.depth for each in results_of(view, stored, notes)}
     scores = {run.label: run.headlines.get(view.scene, {}) for run in view.runs}
-    return Shown(
-        view.scene,
-        stored,
-        {label: depths.get(label) for label in methods},
-        {label: scores.get(label, {}) for label in methods},
-    )
+    return Shown(view.scene, stored, dict.fromkeys(methods) | depths, {label: {} for label in methods} | scores)

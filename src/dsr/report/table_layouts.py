@@ -173,7 +173,7 @@ def to_latex(table: PaperTable, *, published: bool = False) -> str:
         head.append(latex_text(name) + (f"$_{{{latex_text(index)}}}$" if index else ""))
     units = [*("" for _ in facts), *(latex_text(column.unit) for column in columns.values())]
     groups = [list(_latex_rows(group, facts, columns, published=published)) for group in table.groups]
-    texts = []
+    texts: list[str] = []
     for page in _pages([rows for rows in groups if rows]):
         caption = f"{title}, continued." if texts else f"{title}. {' '.join(table.notes)}"
         body = "\n\\midrule\n".join("\n".join(rows) for rows in page)

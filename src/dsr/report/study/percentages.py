@@ -65,7 +65,17 @@ def remarks(answers: Sequence[Answers], key: Key) -> list[str]:
         text = f"two people choose the same picture first in {100 * same:.0f} % of the cases ({100 * chance:.0f} % by "
         text += "guessing)"
         lines.append(text + (f"; Fleiss' kappa {kappa:.2f}" if math.isfinite(kappa) and counts.shape[1] > 1 else ""))
-    return [*lines, *_consistency(answers)]
+    consistent, asked = 0, 0
+    others = []
+    for each in answers:
+        before = {answer.scene: answer.first for answer in each.trials if not answer.again}
+        repeated = [answer.first == before[answer.scene] for answer in each.trials if answer.again]
+        consistent, asked = consistent + sum(repeated), asked + len(repeated)
+        if len(repeated) > 1 and not any(repeated):
+            others.append(f"{each.file}: another first choice each of the {len(repeated)} times a scene came again")
+    if asked:
+        lines.append(f"asked again, people chose the same picture first {consistent} of {asked} times")
+    return lines + others
 
 
 def _ballots(answers: Sequence[Answers], key: Key) -> pd.DataFrame:
@@ -104,49 +114,35 @@ def _rows(ballots: pd.DataFrame, place: tuple[Any, ...]) -> list[dict[str, Any]]
     return rows
 
 
-def _consistency(answers: Sequence[Answers]) -> list[str]:
-    """Report how often participants repeated their first choice, overall, and who never did."""
-    lines = []
-    same, asked = 0, 0
-    for each in answers:
-        before = {answer.scene: answer.first for answer in each.trials if not answer.again}
-        repeated = [answer.first == before[answer.scene] for answer in each.trials if answer.again]
-        same, asked = same + sum(repeated), asked + len(repeated)
-        if len(repeated) > 1 and not any(repeated):
-            lines.append(f"{each.file}: another first choice each of the {len(repeated)} times a scene came again")
-    return [f"asked again, people chose the same picture first {same} of {asked} times", *lines] if asked else []
-
-
 def tables_of(collected: pd.DataFrame) -> Iterator[Table]:
-    """Yield a table per data set, scale and degradation, and one over all data sets if there are several."""
-    for place, rows in collected.groupby(["dataset", "scale", "downsampling"], sort=False):
-        dataset, scale, downsampling = place
+    """Yield a table per data set, scale and degradation, and one over all data sets if there are several.
+
+    The largest percentage of each scene is bold.
+    """
+    for (dataset, scale, downsampling), rows in collected.groupby(["dataset", "scale", "downsampling"], sort=False):
         others = collected[(collected["scale"] == scale) & (collected["downsampling"] == downsampling)]
-        if dataset != ALL or others["dataset"].nunique() > 2:
-            yield _terminal_table(rows, f"{dataset}, x{as_ratio(scale)}, {downsampling} downsampling")
-
-
-def _terminal_table(rows: pd.DataFrame, where: str) -> Table:
-    """Return one table; the largest percentage of each scene is bold."""
-    table = Table(title=f"{escape(where)}: who chose what, %, with 95 % intervals", title_justify="left")
-    table.box, table.padding = box.SIMPLE_HEAD, (0, 1, 0, 0)
-    table.add_column("scene", overflow="fold")
-    table.add_column("method", overflow="fold")
-    for heading in PERCENTAGES.values():
-        table.add_column(heading.replace("User Top", "Top"), justify="right", no_wrap=True)
-    table.add_column("people", justify="right")
-    for scene, of_scene in rows.groupby("scene", sort=False):
-        table.add_section()
-        for number, (_, row) in enumerate(of_scene.iterrows()):
-            cells = []
-            for column in PERCENTAGES:
-                value, low, high = row[column], row[f"{column}_low"], row[f"{column}_high"]
-                shown = f"[bold]{value:.1f}[/]" if value == of_scene[column].max() > 0 else f"{value:.1f}"
-                cells.append(f"{shown} [dim]({low:.0f}-{high:.0f})[/]")
-            name = escape(str(scene)) if number == 0 else ""
-            heading = f"[bold]{name}[/]" if name and scene == AVERAGE else name
-            table.add_row(heading, escape(row["label"]), *cells, str(row["n"]))
-    return table
+        if dataset == ALL and others["dataset"].nunique() <= 2:
+            continue
+        where = escape(f"{dataset}, x{as_ratio(scale)}, {downsampling} downsampling")
+        table = Table(title=f"{where}: who chose what, %, with 95 % intervals", title_justify="left")
+        table.box, table.padding = box.SIMPLE_HEAD, (0, 1, 0, 0)
+        table.add_column("scene", overflow="fold")
+        table.add_column("method", overflow="fold")
+        for heading in PERCENTAGES.values():
+            table.add_column(heading.replace("User Top", "Top"), justify="right", no_wrap=True)
+        table.add_column("people", justify="right")
+        for scene, of_scene in rows.groupby("scene", sort=False):
+            table.add_section()
+            for number, (_, row) in enumerate(of_scene.iterrows()):
+                cells = []
+                for column in PERCENTAGES:
+                    value, low, high = row[column], row[f"{column}_low"], row[f"{column}_high"]
+                    shown = f"[bold]{value:.1f}[/]" if value == of_scene[column].max() > 0 else f"{value:.1f}"
+                    cells.append(f"{shown} [dim]({low:.0f}-{high:.0f})[/]")
+                name = escape(str(scene)) if number == 0 else ""
+                heading = f"[bold]{name}[/]" if name and scene == AVERAGE else name
+                table.add_row(heading, escape(row["label"]), *cells, str(row["n"]))
+        yield table
 
 
 def read_study(path: Path) -> pd.DataFrame:
