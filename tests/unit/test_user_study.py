@@ -19,7 +19,7 @@ from dsr.cli import main
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.camera import Camera
 from dsr.pictures.depth_views import rendering
-from dsr.report.significance import agreement, average_fraction, bootstrap_of_average, wilson
+from dsr.report.significance import agreement, bootstrap_of_average, wilson
 from dsr.report.study import Choice
 from dsr.report.study.files import Candidate, Key, Trial, files_of, read_all, read_answers, read_key, write_key
 from dsr.report.study.percentages import ALL, AVERAGE, COLUMNS, collect, remarks
@@ -100,10 +100,6 @@ def test_interval_of_an_average_is_wilsons_with_one_answer_a_person_where_all_ag
     assert bootstrap_of_average(0 * ones, ones) == pytest.approx(wilson(0, 12))
     low, high = bootstrap_of_average(np.tile([1, 0], (5, 1)), np.ones((5, 2), int))  # one scene of two
     assert low + high == pytest.approx(1)
-
-
-def test_average_weighs_scenes_equally_without_those_without_answers():
-    assert average_fraction(np.array([1, 9, 0]), np.array([2, 9, 0])) == pytest.approx(0.75)
 
 
 def test_agreement_equals_fleiss_own_example():
