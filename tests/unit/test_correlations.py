@@ -1,14 +1,14 @@
 """The metric study: what is a point, what is correlated, and that the figures show it."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from scipy import stats
+from small_runs import made_up_run
 
-from dsr.evaluation.results import Results, Run
+from dsr.evaluation.results import Results
 from dsr.report import correlations
 from dsr.report.correlations import correlate, metric_matrix, save_scatter_matrix, with_reference, write_correlations
 from dsr.report.paper import published
@@ -16,23 +16,16 @@ from dsr.report.paper import published
 VARIANTS = ("e1", "e2", "e3", "e4", "max", "avg")
 
 
-def run(label, count=12, *, seed=0, scale=4, lpips=True, dataset="simgeo"):
+def run(label, count=12, *, seed=0, scale=4, lpips=True):
     """Return a run on scenes whose metrics go with each other more or less."""
     rng = np.random.default_rng([seed, scale, *label.encode()])
-    rows = []
+    scores = {}
     for number in range(count):
-        about = {"dataset": dataset, "scene": f"s{number}", "scale": scale, "downsampling": "box", "seed": seed}
-        about |= {"method": label, "valid_share": 1.0}
         base = rng.random()
-        rows.append({**about, "metric": "RMSE_d", "variant": "", "value": base**2})
-        for metric in ("DSSIM_v", *(["LPIPS_v"] if lpips else [])):
-            values = base + 0.2 * rng.random(6)
-            rows += [
-                {**about, "metric": metric, "variant": v, "value": x} for v, x in zip(VARIANTS, values, strict=True)
-            ]
-    scores = pd.DataFrame(rows)
-    scenes = tuple(scores["scene"].unique())
-    return Run(Path(label), dataset, scale, "box", seed, label, label, scores, {}, {}, {}, scenes)
+        of_scene = scores.setdefault(f"s{number}", {"RMSE_d": base**2})
+        for metric in ("DSSIM_v", "LPIPS_v") if lpips else ("DSSIM_v",):
+            of_scene |= {f"{metric}[{name}]": base + 0.2 * rng.random() for name in VARIANTS}
+    return made_up_run(label, scores, seed=seed, scale=scale)
 
 
 RESULTS = Results((run("Bicubic"), run("MSG"), run("MSG", seed=1), run("MSG", scale=8), run("Mine", 2)))

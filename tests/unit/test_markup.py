@@ -3,47 +3,28 @@
 import io
 import shutil
 import subprocess
-from pathlib import Path
 
 import pandas as pd
 import pytest
+from small_runs import made_up_run
 
-from dsr.evaluation.results import Results, Run
-from dsr.report.table_layouts import (
-    MISSING,
-    latex_text,
-    to_csv,
-    to_document,
-    to_latex,
-    to_markdown,
-)
+from dsr.evaluation.results import Results
+from dsr.report.table_layouts import MISSING, latex_text, to_csv, to_document, to_latex, to_markdown
 from dsr.report.tables import build_tables
 
 ODD = "a|b_*x* 50% & $1 {c} \\d #e ~f ^g <u> `h` \"i\" 'j'"
-FOLDER = "dsr.data.folder.Folder"
 
 
-def run(label, values, *, dataset="mine", seed=0, method="other", target=FOLDER):
+def run(label, values, *, method="other", seed=0):
     """Return a run on a folder of scenes whose RMSE_d is the value in mm, and whose DSSIM_v, too, in thousandths."""
-    about = {"dataset": dataset, "scale": 4, "downsampling": "box", "seed": seed, "method": method}
-    rows = [
-        {**about, "scene": scene, "metric": metric, "variant": variant, "value": value / 1e3, "valid_share": 1.0}
-        for scene, value in values.items()
-        for metric, variant in (("RMSE_d", ""), ("DSSIM_v", "max"))
-    ]
-    settings = {"dataset": {"_target_": target}}
-    return Run(folder=Path("runs", label), label=label, scores=pd.DataFrame(rows), seconds={}, settings=settings,
-               versions={}, scenes=tuple(values), **about)  # fmt: skip
+    scores = {scene: {"RMSE_d": value / 1e3, "DSSIM_v[max]": value / 1e3} for scene, value in values.items()}
+    settings = {"dataset": {"_target_": "dsr.data.folder.Folder"}}
+    return made_up_run(label, scores, dataset="mine", method=method, seed=seed, settings=settings)
 
 
 def study_of(label):
-    shares = {
-        "user_first": 61.5,
-        "user_first_low": 50.25,
-        "user_first_high": 71.0,
-        "user_second": 20.0,
-        "user_top2": 81.5,
-    }
+    first = {"user_first": 61.5, "user_first_low": 50.25, "user_first_high": 71.0}
+    shares = {**first, "user_second": 20.0, "user_top2": 81.5}
     about = {"dataset": "mine", "scene": "lucy", "scale": 4, "downsampling": "box", "label": label}
     return pd.DataFrame([{**about, **shares}])
 
