@@ -2,13 +2,13 @@
 
 import dataclasses
 import io
-import json
 import re
 
 import pandas as pd
 import pytest
+from small_runs import hostile_run
 
-from dsr.evaluation.run_files import load_results, read_run
+from dsr.evaluation.run_files import load_results
 from dsr.report.correlations import save_scatter_matrix
 from dsr.report.study.percentages import PERCENTAGES, read_study
 from dsr.report.table_layouts import escaped, latex_text, to_csv, to_latex, to_markdown
@@ -24,20 +24,9 @@ HOSTILE = "=cmd|' \\input{/etc/passwd} `id` <script>alert(1)</script> $\\frac$"
 @pytest.fixture
 def results(make_run, tmp_path):
     """A run whose method, data set, scene and a metric have a hostile name."""
-    folder = make_run(tmp_path / "run", label=HOSTILE, method=HOSTILE, dataset=HOSTILE)
-    scene = HOSTILE.replace("/", "")
-    for kind in ("scenes", "predictions"):
-        (folder / kind / "cube_no_texture.npz").rename(folder / kind / f"{scene}.npz")
-    scores = pd.read_csv(folder / "scores.csv", keep_default_na=False)
-    scores["scene"] = scene
-    scores.loc[scores["metric"] == "Bumpiness_d", "metric"] = HOSTILE
-    scores.to_csv(folder / "scores.csv", index=False)
-    summary = json.loads((folder / "summary.json").read_text())
-    summary["seconds"] = {scene: 0.25}
-    summary["metrics"] = {HOSTILE: {"heading": HOSTILE, "unit": HOSTILE, "digits": 1}}
-    (folder / "summary.json").write_text(json.dumps(summary))
-    assert set(read_run(folder).scores["method"]) == {HOSTILE}
-    return load_results([folder])
+    results = load_results([hostile_run(make_run, tmp_path / "run", HOSTILE)])
+    assert set(results.runs[0].scores["method"]) == {HOSTILE}
+    return results
 
 
 def test_tables_of_a_report_have_no_command_or_tag(results):
@@ -62,12 +51,8 @@ def test_markdown_rows_have_as_many_cells_as_the_head(results):
 def test_latex_rows_do_not_begin_with_an_option(results):
     [run] = results.runs
     scene = run.scenes[0]
-    odd = dataclasses.replace(
-        run,
-        scenes=("[2pt]",),
-        scores=run.scores.assign(scene="[2pt]"),
-        seconds={"[2pt]": run.seconds[scene]},
-    )
+    scores = run.scores.assign(scene="[2pt]")
+    odd = dataclasses.replace(run, scenes=("[2pt]",), scores=scores, seconds={"[2pt]": run.seconds[scene]})
     tables = build_tables(dataclasses.replace(results, runs=(odd,)), None)
     assert any("\n{}[2pt] & " in to_latex(table) for table in tables)
     assert not any(re.search(r"(\\\\|rule)\s*[\[*]", to_latex(table)) for table in tables)
