@@ -94,28 +94,17 @@ def offered() -> list[tuple[str, str]]:
 
 
 class Work:
-    """Runs commands on uploads, in processes with limits, and in a folder that is deleted with its results.
-
-    Args:
-        request: the limits.
-        folder: where uploads and results are.
-
-    """
+    """Runs commands on uploads, in processes with limits, and in a folder that is deleted with its results."""
 
     def __init__(self, request: BrowserRequest, folder: Path) -> None:
         self.request, self._folder = request, folder
         self.process: subprocess.Popen[bytes] | None = None
 
     def compute(self, *given: Any) -> Iterator[_Shown]:
-        """Upsample a photo's depth map, or a frame of a capture.
+        """Upsample a photo's depth map, or a frame of a capture; yield what to show.
 
-        Args:
-            *given: the paths of a capture, a photo, a depth map, a camera and a mask, then the number of the capture's
-                frame from 1, then the values of ``_CHOICES``; empty or None for what is not given.
-
-        Yields:
-            What has been said so far, and in the end the page, the expected errors in Markdown, and the files.
-
+        Given are the paths of a capture, a photo, a depth map, a camera and a mask, the number of the capture's frame
+        from 1, and the values of ``_CHOICES``; empty or None for what is missing.
         """
         capture, frame, pair = given[0], given[5], dict(zip(_PAIR, given[1:5], strict=True))
         if bool(capture) == bool(pair["--rgb"] and pair["--depth"]):

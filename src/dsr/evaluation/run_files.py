@@ -120,28 +120,12 @@ def read_run(folder: Path) -> Run:
     dataset = str(scores["dataset"].iloc[0]) if len(scores) else summary.dataset
     scenes = tuple(scene for scene in summary.seconds if prediction_path(folder, scene).is_file())
     scores = scores[scores["scene"].isin(scenes)]
-    return Run(
-        folder,
-        dataset,
-        as_ratio(summary.scale),
-        summary.downsampling,
-        summary.seed,
-        summary.method,
-        summary.label,
-        scores,
-        summary.seconds,
-        settings,
-        versions.model_extra or {},
-        scenes,
-        summary.unanswered,
-        summary.metrics,
-        notes=summary.notes,
-        truths=summary.truths,
-    )
+    own = {"scores": scores, "settings": settings, "versions": versions.model_extra or {}, "scenes": scenes}
+    return Run(folder, **{**dict(summary), "dataset": dataset, "scale": as_ratio(summary.scale), **own})
 
 
 class _Summary(BaseModel, strict=True, allow_inf_nan=False):
-    """The content of ``summary.json``."""
+    """The content of ``summary.json``, by the names of :class:`~dsr.evaluation.results.Run`."""
 
     dataset: str
     scale: Annotated[Number, Field(ge=1, le=_LARGEST_SCALE)]
@@ -150,8 +134,8 @@ class _Summary(BaseModel, strict=True, allow_inf_nan=False):
     seed: Annotated[Whole, Field(ge=0)]
     seconds: dict[str, Annotated[Number, Field(ge=0)]]
     label: str
-    unanswered: dict[str, str] = {}
-    metrics: dict[str, MetricFormat] = {}
+    unsolved: Annotated[dict[str, str], Field(alias="unanswered")] = {}
+    formats: Annotated[dict[str, MetricFormat], Field(alias="metrics")] = {}
     notes: dict[str, list[str]] = {}
     truths: dict[str, str] = {}
 

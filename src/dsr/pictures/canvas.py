@@ -110,24 +110,15 @@ class Canvas:
 
 
 class Panels(Canvas):
-    """Rows of panels, in the middle of which stand pictures of one ratio of height to width.
-
-    Args:
-        shape: number of rows and columns.
-        aspect: of the pictures.
-        size: width and height of a panel, inches, as are the following.
-        across: left of the first column, and right of each one.
-        down: above the first row, between rows, and below the last one.
-
-    """
+    """Rows of panels, in the middle of which stand pictures of one ratio of height to width; all lengths in inches."""
 
     def __init__(
         self,
-        shape: tuple[int, int],
-        aspect: float,
-        size: tuple[float, float],
-        across: tuple[float, float],
-        down: tuple[float, float, float],
+        shape: tuple[int, int],  # number of rows and columns
+        aspect: float,  # of the pictures
+        size: tuple[float, float],  # width and height of a panel
+        across: tuple[float, float],  # left of the first column, and right of each one
+        down: tuple[float, float, float],  # above the first row, between rows, and below the last one
     ) -> None:
         (rows, columns), self._aspect, (self._width, self._height) = shape, aspect, size
         (self._left, self._gap), (self._above, self._between, below) = across, down

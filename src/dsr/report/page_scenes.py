@@ -49,14 +49,9 @@ _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PN
 
 @dataclass
 class PictureStore:
-    """Pictures by name, each stored once, as lossless PNG in base64.
+    """Pictures by name, each stored once, as lossless PNG in base64."""
 
-    Args:
-        longest: maximum longer side, pixels; larger pictures are reduced.
-
-    """
-
-    longest: int
+    longest: int  # maximum longer side, pixels; larger pictures are reduced
     pictures: dict[str, str] = field(default_factory=dict)
     reduced: bool = False
 

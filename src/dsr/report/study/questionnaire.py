@@ -48,20 +48,9 @@ def build_study(
     *,
     overwrite: bool = False,
 ) -> Built:
-    """Write the page ``index.html`` and the key ``key.json`` of a study.
+    """Write the page ``index.html`` and the key ``key.json`` of a study into a directory.
 
-    Args:
-        results: runs to compare.
-        folder: output directory, created if missing.
-        choice: selection of the questions.
-        progress: shows the scenes that are drawn.
-        overwrite: whether to replace another study in the directory; its answers can then no longer be collected.
-
-    Raises:
-        ValueError: nothing is left to compare, the choice names a value that no run has, a file is damaged, the title
-            contains the name of a method, or the directory holds another study.
-        TargetError: a link, a device, a pipe or a socket is in the place of the key or the page.
-
+    Another study in it, whose answers can then no longer be collected, is replaced only if ``overwrite``.
     """
     choice = choice or Choice()
     expect_targets(folder, (KEY_NAME, PAGE_NAME))
