@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow  # drawing takes a second
 
 def save_grids(folder, results, *kinds, light="e1", notes=None):
     notes = [] if notes is None else notes
-    for page in pages_of(results, kinds, light, notes):
+    for page in pages_of(results, kinds, light):
         notes += draw_page(folder, results, page)[1]
 
 

@@ -8,10 +8,9 @@ percentile of the ground truth, those of errors the 98th of all methods' absolut
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ import numpy as np
 from matplotlib.colors import ListedColormap
 from torch import Tensor
 
-from dsr.evaluation.results import BenchmarkSetting, Results, sample_path
+from dsr.evaluation.results import BenchmarkSetting, Results
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import FIGURE_LIGHT
 from dsr.metrics.catalogue import KNOWN_FORMATS
@@ -29,11 +28,10 @@ from dsr.pictures.canvas import save_both
 from dsr.pictures.depth_views import Window, limits_of, rendering, strongest_window
 from dsr.pictures.grids import Cell, Row, draw_grid
 from dsr.pictures.lights_figure import save_lights_figure
-from dsr.report.shown_scenes import Shown, shown_of, stored_sample, views_of
+from dsr.report.shown_scenes import Shown, shown_of, views_of
 from dsr.report.tables import unique_name
 from dsr.report.worker_pool import WorkerPool
 from dsr.sample import DepthSample
-from dsr.utils.arrays import array_headers
 
 ROWS = 5
 """Maximum number of scenes on a page."""
@@ -54,7 +52,7 @@ class Figures:
     def __init__(self, folder: Path, workers: WorkerPool, light: str = FIGURE_LIGHT) -> None:
         self.notes: list[str] = []
         """One line per scene or result that could not be drawn."""
-        self._pages = [*pages_of(workers.results, KINDS, light, self.notes), None]
+        self._pages = [*pages_of(workers.results, KINDS, light), None]
         self._drawn = workers.map(functools.partial(draw_page, folder), self._pages)
 
     def save(self, progress: Callable[[int, int, str], None] | None = None) -> list[Path]:
@@ -80,24 +78,14 @@ class Page:
     light: str  # of the renderings
 
 
-def pages_of(results: Results, kinds: Iterable[str], light: str, notes: list[str]) -> list[Page]:
-    """Return the pages of some kinds of grids, from the names of the files alone; ``notes`` takes what is left out."""
+def pages_of(results: Results, kinds: Iterable[str], light: str) -> list[Page]:
+    """Return the pages of some kinds of grids."""
     found = []
     for kind in kinds:
         names: set[str] = set()
         for problem in results.problems():
             name = unique_name("{}_x{}_{}".format(*problem), names)
-            scenes = []
-            for view in views_of(results, problem):
-                stored = next((run for run in view.runs if run.has_sample(view.scene)), None)
-                if stored is None:
-                    stored_sample(view, notes)
-                    continue
-                arrays: Collection[str] = ("depth",)  # a damaged scene may have ground truth elsewhere
-                with contextlib.suppress(ValueError, OSError):
-                    arrays = array_headers(sample_path(stored.folder, view.scene))
-                if kind != "errors" or "depth" in arrays:
-                    scenes.append(view.scene)
+            scenes = [view.scene for view in views_of(results, problem)]
             for number, start in enumerate(range(0, len(scenes), ROWS), start=1):
                 rows = tuple(scenes[start : start + ROWS])
                 found.append(Page(kind, problem, f"{kind}_{name}_{number}", rows, light))
