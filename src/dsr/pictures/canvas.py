@@ -214,7 +214,7 @@ def encode_row(panels: Sequence[np.ndarray]) -> bytes:
 def with_holes(picture: np.ndarray) -> np.ndarray:
     """Return an (H, W, 3) picture with the pixels that are not finite in the hole colour."""
     known = np.isfinite(picture).all(axis=2, keepdims=True)
-    return np.where(known, picture, colours("gray").get_bad()[:3])
+    return np.where(known, picture, np.array(colours("gray").get_bad()[:3], picture.dtype))
 
 
 def _resized(panel: np.ndarray, size: tuple[int, int]) -> np.ndarray:
