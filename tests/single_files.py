@@ -20,7 +20,7 @@ from dsr.io.trajectories import read_poses, read_transform
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, save_network
-from dsr.report.study.key import Candidate, Key, Trial, read_key, write_key
+from dsr.report.study.files import Candidate, Key, Trial, read_key, write_key
 from dsr.utils.arrays import read_torch_file
 
 DEPTH = np.linspace(1, 2, 48 * 64, dtype=np.float32).reshape(48, 64)

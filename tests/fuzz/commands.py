@@ -18,7 +18,7 @@ from small_files import written
 
 from dsr.app.entry import run_eval, run_train
 from dsr.cli import main
-from dsr.report.study.key import write_key
+from dsr.report.study.files import write_key
 from dsr.report.study.percentages import COLUMNS
 from dsr.training.module import SuperResolution
 from dsr.utils.configuration import config_directories

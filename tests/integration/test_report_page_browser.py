@@ -1,13 +1,12 @@
 """The page of a report in a browser: it sorts, lights, compares and reads out what it should, and asks nobody."""
 
 import base64
-import json
 
 import cv2
 import matplotlib as mpl
 import numpy as np
-import pandas as pd
 import pytest
+from small_runs import hostile_run
 
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.surface import render
@@ -152,18 +151,7 @@ def test_expected_errors_have_the_colours_and_limits_of_the_measured_ones(opened
 
 
 def test_names_in_the_files_of_a_run_are_shown_and_not_run(opened, make_run, tmp_path):
-    folder = make_run(tmp_path / "run", label=SPITEFUL, method=SPITEFUL, dataset=SPITEFUL)
-    name = SPITEFUL.replace("/", "")
-    for kind in ("scenes", "predictions"):
-        (folder / kind / "cube_no_texture.npz").rename(folder / kind / f"{name}.npz")
-    scores = pd.read_csv(folder / "scores.csv", keep_default_na=False)
-    scores["scene"] = name
-    scores.loc[scores["metric"] == "Bumpiness_d", "metric"] = SPITEFUL
-    scores.to_csv(folder / "scores.csv", index=False)
-    summary = json.loads((folder / "summary.json").read_text())
-    summary["seconds"] = {name: 0.25}
-    summary["metrics"] = {SPITEFUL: {"heading": SPITEFUL, "unit": SPITEFUL, "digits": 1}}
-    (folder / "summary.json").write_text(json.dumps(summary))
+    folder, name = hostile_run(make_run, tmp_path / "run", SPITEFUL), SPITEFUL.replace("/", "")
     results = load_results([folder])
     write_tables(tmp_path / "tables", results)
     save_page(tmp_path / "index.html", Pictures(WorkerPool(results)))

@@ -54,7 +54,7 @@ from dsr.metrics.catalogue import score_image
 from dsr.metrics.classes import DSSIMv, LPIPSv, RMSEd, visual_metrics
 from dsr.metrics.functional import SurfacePair, dssim_v
 from dsr.metrics.losses import VisualLoss
-from dsr.report.page.content import problem_data, standings
+from dsr.report.page import problem_data, standings
 from dsr.report.tables import build_tables
 from dsr.sample import DepthSample
 from dsr.training.objective import DepthObjective, SurfaceObjective

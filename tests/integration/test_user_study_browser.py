@@ -10,7 +10,7 @@ import pytest
 from dsr.cli import main
 from dsr.evaluation.run_files import load_results
 from dsr.report.study import Choice
-from dsr.report.study.key import read_key
+from dsr.report.study.files import read_key
 from dsr.report.study.questionnaire import build_study
 
 LABELS = {"msg_v": "MSG-V", "bicubic": "Bicubic", "dip": "DIP"}
@@ -120,33 +120,27 @@ def test_study_runs_from_the_first_choice_to_the_table(visit, study, tmp_path, c
     assert set(table["n"]) == {2}
 
 
-def test_keys_choose_undo_and_go_on_and_back(visit):
-    somebody = begun(visit())
+DAMAGES = ("'{'", "'null'", *(f"JSON.stringify({{...person, started: 'x', {part}}})" for part in (
+    "trials: 3", "index: 99", "trials: person.trials.slice(1)", "trials: person.trials.map(() => ({scene: 'other'}))",
+)))  # fmt: skip
+
+
+def test_keys_choose_in_an_order_that_stays_and_damaged_storage_does_not_stop_the_page(visit):
+    """One visit: storage that was damaged, keys to choose, undo, go on and back, and orders of other people."""
+    somebody = visit()
+    for damage in DAMAGES:
+        somebody.page.evaluate(f"localStorage.setItem(STORE, {damage})")
+        somebody.page.reload()
+        assert somebody.page.locator("#welcome").is_visible(), damage
+    begun(somebody)
+    script = "() => [...document.querySelectorAll('#grid img')].map(each => each.src)"
+    pictures = somebody.page.evaluate(script)
     for keys, chosen in (
         (["3", "1"], ["3", "1"]), (["2"], ["3", "1"]), (["Backspace"], ["3", None]), (["Enter"], ["3", None]),
         (["2", "Enter"], [None, None]), (["ArrowLeft"], ["3", "2"]), (["3"], [None, "2"]),
     ):  # fmt: skip
         somebody.press(*keys)
         assert ranks(somebody) == chosen, keys
-
-
-DAMAGES = ("'{'", "'null'", *(f"JSON.stringify({{...person, started: 'x', {part}}})" for part in (
-    "trials: 3", "index: 99", "trials: person.trials.slice(1)", "trials: person.trials.map(() => ({scene: 'other'}))",
-)))  # fmt: skip
-
-
-def test_damaged_storage_does_not_stop_the_page(visit):
-    somebody = visit()
-    for damage in DAMAGES:
-        somebody.page.evaluate(f"localStorage.setItem(STORE, {damage})")
-        somebody.page.reload()
-        assert somebody.page.locator("#welcome").is_visible(), damage
-
-
-def test_order_stays_for_a_person_and_is_uniform_over_many(visit):
-    somebody = begun(visit())
-    script = "() => [...document.querySelectorAll('#grid img')].map(each => each.src)"
-    pictures = somebody.page.evaluate(script)
     somebody.page.reload()
     assert somebody.page.evaluate(script) == pictures
     orders = somebody.page.evaluate("[...Array(4800).keys()].map(() => shuffled(['a', 'b', 'c', 'd']).join(''))")

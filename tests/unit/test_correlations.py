@@ -1,39 +1,31 @@
 """The metric study: what is a point, what is correlated, and that the figures show it."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from scipy import stats
+from small_runs import made_up_run
 
-from dsr.evaluation.results import Results, Run
-from dsr.report import correlation_figure
-from dsr.report.correlation_figure import save_scatter_matrix
-from dsr.report.correlations import correlate, metric_matrix, with_reference, write_correlations
+from dsr.evaluation.results import Results
+from dsr.report import correlations
+from dsr.report.correlations import correlate, metric_matrix, save_scatter_matrix, with_reference, write_correlations
 from dsr.report.paper import published
 
 VARIANTS = ("e1", "e2", "e3", "e4", "max", "avg")
 
 
-def run(label, count=12, *, seed=0, scale=4, lpips=True, dataset="simgeo"):
+def run(label, count=12, *, seed=0, scale=4, lpips=True):
     """Return a run on scenes whose metrics go with each other more or less."""
     rng = np.random.default_rng([seed, scale, *label.encode()])
-    rows = []
+    scores = {}
     for number in range(count):
-        about = {"dataset": dataset, "scene": f"s{number}", "scale": scale, "downsampling": "box", "seed": seed}
-        about |= {"method": label, "valid_share": 1.0}
         base = rng.random()
-        rows.append({**about, "metric": "RMSE_d", "variant": "", "value": base**2})
-        for metric in ("DSSIM_v", *(["LPIPS_v"] if lpips else [])):
-            values = base + 0.2 * rng.random(6)
-            rows += [
-                {**about, "metric": metric, "variant": v, "value": x} for v, x in zip(VARIANTS, values, strict=True)
-            ]
-    scores = pd.DataFrame(rows)
-    scenes = tuple(scores["scene"].unique())
-    return Run(Path(label), dataset, scale, "box", seed, label, label, scores, {}, {}, {}, scenes)
+        of_scene = scores.setdefault(f"s{number}", {"RMSE_d": base**2})
+        for metric in ("DSSIM_v", "LPIPS_v") if lpips else ("DSSIM_v",):
+            of_scene |= {f"{metric}[{name}]": base + 0.2 * rng.random() for name in VARIANTS}
+    return made_up_run(label, scores, seed=seed, scale=scale)
 
 
 RESULTS = Results((run("Bicubic"), run("MSG"), run("MSG", seed=1), run("MSG", scale=8), run("Mine", 2)))
@@ -102,7 +94,7 @@ def test_missing_lpips_leaves_the_rest_and_one_line_says_so(tmp_path, monkeypatc
     text = write_correlations(tmp_path, results)[-1].read_text(encoding="utf-8")
     assert "There is no LPIPS_v in these 5 results" in text
     drawn = {}
-    monkeypatch.setattr(correlation_figure, "write_figure", lambda path, figure, *_: drawn.update({path.name: figure}))
+    monkeypatch.setattr(correlations, "write_figure", lambda path, figure, *_: drawn.update({path.name: figure}))
     save_scatter_matrix(results, tmp_path)
     assert list(drawn) == ["scatter_matrix.pdf", "scatter_matrix.png"]
     assert "no LPIPS_v in these results" in drawn["scatter_matrix.pdf"].texts[0].get_text()

@@ -46,8 +46,8 @@ from dsr.methods.networks.trained import NETWORKS, load_msg_weights
 from dsr.methods.networks.weight_files import is_dsr_weights, load_network
 from dsr.methods.recipe import read_recipe
 from dsr.methods.weights import packaged_weights
-from dsr.report.study.answers import files_of
-from dsr.report.study.study_table import read_study
+from dsr.report.study.files import files_of
+from dsr.report.study.percentages import read_study
 from dsr.report.surface_page import is_view
 from dsr.sample import DepthSample
 from dsr.utils import guards

@@ -12,7 +12,7 @@ from dsr.geometry.surface import lights
 from dsr.pictures import canvas, lights_figure
 from dsr.pictures.depth_views import Window, strongest_window
 from dsr.report import figures as figures_of_runs
-from dsr.report.figures import KINDS, Figures, details_of, pages_of, save_page
+from dsr.report.figures import KINDS, Figures, details_of, draw_page, pages_of
 from dsr.report.worker_pool import WorkerPool
 
 pytestmark = pytest.mark.slow  # drawing takes a second
@@ -20,8 +20,8 @@ pytestmark = pytest.mark.slow  # drawing takes a second
 
 def save_grids(folder, results, *kinds, light="e1", notes=None):
     notes = [] if notes is None else notes
-    for page in pages_of(results, kinds, light, notes):
-        save_page(folder, results, page, notes)
+    for page in pages_of(results, kinds, light):
+        notes += draw_page(folder, results, page)[1]
 
 
 @pytest.fixture

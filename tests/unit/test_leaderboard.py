@@ -1,14 +1,11 @@
 """The standings: ranks within families and settings, over the scenes that all methods have."""
 
-from pathlib import Path
-from typing import Any
-
-import pandas as pd
 import pytest
+from small_runs import made_up_run
 
-from dsr.evaluation.results import Results, Run
+from dsr.evaluation.results import Results
 from dsr.metrics.formats import MetricFormat
-from dsr.report.page.content import standings
+from dsr.report.page import standings
 
 FORMATS = {
     "RMSE_d": MetricFormat("RMSE_d", "mm", 1e3, 1, position=1),
@@ -16,21 +13,11 @@ FORMATS = {
 }
 
 
-def run(label: str, values: dict[str, dict[str, float]], dataset: str = "mine") -> Run:
-    """Return a run with values by scene and metric."""
-    about: dict[str, Any] = {"dataset": dataset, "scale": 4, "downsampling": "box", "seed": 0}
-    rows = [
-        {**about, "method": label, "scene": scene, "metric": metric, "variant": "", "value": value, "valid_share": 1.0}
-        for scene, own in values.items()
-        for metric, value in own.items()
-    ]
-    return Run(
-        folder=Path("runs", label, dataset), method=label, label=label, scores=pd.DataFrame(rows), seconds={},
-        settings={}, versions={}, scenes=tuple(values), formats=FORMATS, **about,
-    )  # fmt: skip
+def run(label, values, dataset="mine"):
+    return made_up_run(label, values, dataset=dataset, formats=FORMATS)
 
 
-def test_families_weigh_the_same_and_directions_are_heard() -> None:
+def test_families_weigh_the_same_and_directions_are_heard():
     near = run("Near", {"hall": {"RMSE_d": 0.01, "F1": 0.1, "F2": 0.1, "F3": 0.1}})
     sharp = run("Sharp", {"hall": {"RMSE_d": 0.02, "F1": 0.9, "F2": 0.9, "F3": 0.9}})
     rows = standings(Results((near, sharp)))
@@ -38,7 +25,7 @@ def test_families_weigh_the_same_and_directions_are_heard() -> None:
     assert rows[0]["values"]["RMSE_d"] == [pytest.approx(10)]
 
 
-def test_means_are_over_the_scenes_that_all_methods_have() -> None:
+def test_means_are_over_the_scenes_that_all_methods_have():
     one = run("One", {"hall": {"RMSE_d": 0.03}, "yard": {"RMSE_d": 0.001}})
     two = run("Two", {"hall": {"RMSE_d": 0.02}})
     rows = standings(Results((one, two)))
@@ -46,7 +33,7 @@ def test_means_are_over_the_scenes_that_all_methods_have() -> None:
     assert rows[1]["values"]["RMSE_d"] == [pytest.approx(30)]
 
 
-def test_method_without_a_setting_stands_last_and_without_means() -> None:
+def test_method_without_a_setting_stands_last_and_without_means():
     one, two = (run(name, {"hall": {"RMSE_d": value}}) for name, value in (("One", 0.03), ("Two", 0.02)))
     more = run("One", {"lake": {"RMSE_d": 0.05}}, dataset="other")
     rows = standings(Results((one, two, more)))

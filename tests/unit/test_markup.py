@@ -2,47 +2,34 @@
 
 import dataclasses
 import io
-import json
 import re
 import shutil
 import subprocess
-from pathlib import Path
 
 import pandas as pd
 import pytest
+from small_runs import hostile_run, made_up_run
 
-from dsr.evaluation.results import Results, Run
-from dsr.evaluation.run_files import load_results, read_run
-from dsr.report.correlation_figure import save_scatter_matrix
-from dsr.report.study.study_table import PERCENTAGES, read_study
+from dsr.evaluation.results import Results
+from dsr.evaluation.run_files import load_results
+from dsr.report.correlations import save_scatter_matrix
+from dsr.report.study.percentages import PERCENTAGES, read_study
 from dsr.report.table_layouts import MISSING, escaped, latex_text, to_csv, to_document, to_latex, to_markdown
 from dsr.report.tables import build_tables
 
 ODD = "a|b_*x* 50% & $1 {c} \\d #e ~f ^g <u> `h` \"i\" 'j'"
-FOLDER = "dsr.data.folder.Folder"
 
 
-def run(label, values, *, dataset="mine", seed=0, method="other", target=FOLDER):
+def run(label, values, *, method="other", seed=0):
     """Return a run on a folder of scenes whose RMSE_d is the value in mm, and whose DSSIM_v, too, in thousandths."""
-    about = {"dataset": dataset, "scale": 4, "downsampling": "box", "seed": seed, "method": method}
-    rows = [
-        {**about, "scene": scene, "metric": metric, "variant": variant, "value": value / 1e3, "valid_share": 1.0}
-        for scene, value in values.items()
-        for metric, variant in (("RMSE_d", ""), ("DSSIM_v", "max"))
-    ]
-    settings = {"dataset": {"_target_": target}}
-    return Run(folder=Path("runs", label), label=label, scores=pd.DataFrame(rows), seconds={}, settings=settings,
-               versions={}, scenes=tuple(values), **about)  # fmt: skip
+    scores = {scene: {"RMSE_d": value / 1e3, "DSSIM_v[max]": value / 1e3} for scene, value in values.items()}
+    settings = {"dataset": {"_target_": "dsr.data.folder.Folder"}}
+    return made_up_run(label, scores, dataset="mine", method=method, seed=seed, settings=settings)
 
 
 def study_of(label):
-    shares = {
-        "user_first": 61.5,
-        "user_first_low": 50.25,
-        "user_first_high": 71.0,
-        "user_second": 20.0,
-        "user_top2": 81.5,
-    }
+    first = {"user_first": 61.5, "user_first_low": 50.25, "user_first_high": 71.0}
+    shares = {**first, "user_second": 20.0, "user_top2": 81.5}
     about = {"dataset": "mine", "scene": "lucy", "scale": 4, "downsampling": "box", "label": label}
     return pd.DataFrame([{**about, **shares}])
 
@@ -182,20 +169,9 @@ HOSTILE = "=cmd|' \\input{/etc/passwd} `id` <script>alert(1)</script> $\\frac$"
 @pytest.fixture
 def hostile(make_run, tmp_path):
     """A run whose method, data set, scene and a metric have a hostile name."""
-    folder = make_run(tmp_path / "run", label=HOSTILE, method=HOSTILE, dataset=HOSTILE)
-    scene = HOSTILE.replace("/", "")
-    for kind in ("scenes", "predictions"):
-        (folder / kind / "cube_no_texture.npz").rename(folder / kind / f"{scene}.npz")
-    scores = pd.read_csv(folder / "scores.csv", keep_default_na=False)
-    scores["scene"] = scene
-    scores.loc[scores["metric"] == "Bumpiness_d", "metric"] = HOSTILE
-    scores.to_csv(folder / "scores.csv", index=False)
-    summary = json.loads((folder / "summary.json").read_text())
-    summary["seconds"] = {scene: 0.25}
-    summary["metrics"] = {HOSTILE: {"heading": HOSTILE, "unit": HOSTILE, "digits": 1}}
-    (folder / "summary.json").write_text(json.dumps(summary))
-    assert set(read_run(folder).scores["method"]) == {HOSTILE}
-    return load_results([folder])
+    results = load_results([hostile_run(make_run, tmp_path / "run", HOSTILE)])
+    assert set(results.runs[0].scores["method"]) == {HOSTILE}
+    return results
 
 
 def test_tables_of_a_report_have_no_command_or_tag(hostile):

@@ -3,43 +3,33 @@
 import math
 import statistics
 from dataclasses import replace
-from pathlib import Path
 
 import pandas as pd
 import pytest
+from small_runs import made_up_run
 
 from dsr.evaluation.results import Results, Run
 from dsr.metrics.formats import MetricFormat
 from dsr.report.paper import PAPER_SCENES, Place, published, sets_of_dataset, sets_of_summary
-from dsr.report.study.study_table import read_study
+from dsr.report.study.percentages import read_study
 from dsr.report.table_layouts import to_markdown
 from dsr.report.tables import build_tables
 
 SIMGEO = (*PAPER_SCENES["simgeo"][:5], "statue")
 
 
-def run(
-    label, values, *, dataset="simgeo", seed=0, scale=4, downsampling="box", method=None, share=1.0, range_type=None,
-    **settings,
-):  # fmt: skip
+ABOUT = ("dataset", "seed", "scale", "downsampling", "method", "share")
+
+
+def run(label, values, *, range_type=None, **given):
     """Return a run whose RMSE_d is the scenes' value in mm, and whose DSSIM_v, in thousandths, is ten times that."""
-    rows = []
-    for scene, value in values.items():
-        about = {"dataset": dataset, "scene": scene, "scale": scale, "downsampling": downsampling, "seed": seed}
-        about |= {"method": method or label.lower().replace("-", "_"), "valid_share": share}
-        rows.append({**about, "metric": "RMSE_d", "variant": "", "value": value / 1e3})
-        rows += [
-            {**about, "metric": "DSSIM_v", "variant": variant, "value": value / 1e2 * factor}
-            for variant, factor in (("e1", 0.5), ("max", 1.0), ("avg", 0.7))
-        ]
-    scores = pd.DataFrame(rows)
-    name = method or label.lower().replace("-", "_")
-    about = {"dataset": dataset, "scale": scale, "downsampling": downsampling, "seed": seed}
-    settings = {"dataset": settings, "downsampling": {"name": "box", "range_type": range_type}}
-    return Run(
-        folder=Path("runs", f"{label}{seed}"), method=name, label=label, scores=scores, seconds={}, settings=settings,
-        versions={}, scenes=tuple(values), **about,
-    )  # fmt: skip
+    scores = {
+        scene: {"RMSE_d": value / 1e3, "DSSIM_v[e1]": value / 200, "DSSIM_v[max]": value / 1e2, "DSSIM_v[avg]": 0.1}
+        for scene, value in values.items()
+    }
+    about = {name: given.pop(name) for name in ABOUT if name in given}
+    settings = {"dataset": given, "downsampling": {"name": "box", "range_type": range_type}}
+    return made_up_run(label, scores, settings=settings, **about)
 
 
 def tables(*runs, study=None):

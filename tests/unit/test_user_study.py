@@ -19,10 +19,9 @@ from dsr.cli import main
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.camera import Camera
 from dsr.pictures.depth_views import rendering
-from dsr.report.significance import agreement, average_fraction, bootstrap_of_average, wilson
+from dsr.report.significance import agreement, bootstrap_of_average, wilson
 from dsr.report.study import Choice
-from dsr.report.study.answers import files_of, read_all, read_answers
-from dsr.report.study.key import Candidate, Key, Trial, read_key, write_key
+from dsr.report.study.files import Candidate, Key, Trial, files_of, read_all, read_answers, read_key, write_key
 from dsr.report.study.percentages import ALL, AVERAGE, COLUMNS, collect, remarks
 from dsr.report.study.questionnaire import build_study, grey_png
 
@@ -33,30 +32,17 @@ CANDIDATES = {
 }
 METHODS = {"V": "aa", "B": "bb", "D": "cc"}
 SCENES = {"s1": "cube", "s2": "statue"}
-KEY = Key(
-    "0123456789ab",
-    "e4",
-    2,
-    0,
-    {name: Trial("simgeo", scene, 4, "box", CANDIDATES) for name, scene in SCENES.items()},
-)
+TRIALS = {name: Trial("simgeo", scene, 4, "box", CANDIDATES) for name, scene in SCENES.items()}
+KEY = Key("0123456789ab", "e4", 2, 0, TRIALS)
 
 
 def answers(person, *choices, minute=0, **changes):
     """Return a file's content; a choice such as "VB" is MSG-V first and Bicubic second, one for each scene."""
-    trials = [
-        {
-            "scene": scene,
-            "again": False,
-            "order": ["cc", "aa", "bb"],
-            "first": METHODS[a],
-            "second": METHODS[b],
-            "ms": 5e3,
-        }
-        for scene, (a, b) in zip(SCENES, choices, strict=True)
-    ]
-    for trial in trials:
-        trial["ms"] += 100 * sum(person.encode())  # people differ in how long they take
+    more = 100 * sum(person.encode())  # people differ in how long they take
+    trials = []
+    for scene, (a, b) in zip(SCENES, choices, strict=True):
+        chosen = {"order": ["cc", "aa", "bb"], "first": METHODS[a], "second": METHODS[b]}
+        trials.append({"scene": scene, "again": False, "ms": 5e3 + more, **chosen})
     finished = f"2024-05-01T12:{minute:02}:00.000Z"
     return {"study": KEY.study, "page": 1, "participant": person, "finished": finished, "trials": trials} | changes
 
@@ -75,18 +61,13 @@ def collected(folder, *contents, key=KEY):
 
 
 def row(table, dataset, scene, label):
-    [found] = table[(table["dataset"] == dataset) & (table["scene"] == scene) & (table["label"] == label)].to_dict(
-        "records"
-    )
+    here = (table["dataset"] == dataset) & (table["scene"] == scene) & (table["label"] == label)
+    [found] = table[here].to_dict("records")
     return found
 
 
-FOUR = (
-    answers("p1", "VB", "VD"),
-    answers("p2", "VB", "BV"),
-    answers("p3", "VD", "BV"),
-    answers("p4", "BV", "VB"),
-)
+GIVEN = {"p1": ("VB", "VD"), "p2": ("VB", "BV"), "p3": ("VD", "BV"), "p4": ("BV", "VB")}
+FOUR = tuple(answers(person, *choices) for person, choices in GIVEN.items())
 
 
 @pytest.mark.parametrize(("count", "n"), [(0, 1), (1, 1), (0, 136), (3, 136), (5, 10), (136, 136)])
@@ -101,10 +82,6 @@ def test_interval_of_an_average_is_wilsons_with_one_answer_a_person_where_all_ag
     assert bootstrap_of_average(0 * ones, ones) == pytest.approx(wilson(0, 12))
     low, high = bootstrap_of_average(np.tile([1, 0], (5, 1)), np.ones((5, 2), int))  # one scene of two
     assert low + high == pytest.approx(1)
-
-
-def test_average_weighs_scenes_equally_without_those_without_answers():
-    assert average_fraction(np.array([1, 9, 0]), np.array([2, 9, 0])) == pytest.approx(0.75)
 
 
 def test_agreement_equals_fleiss_own_example():
@@ -317,12 +294,8 @@ def test_page_reveals_no_method_scene_or_directory(tmp_path, runs):
     for name in ("bicubic", "msg", "dip", "folder_of", "simgeo", "cube", "statue"):
         assert name not in words.casefold()
     assert str(tmp_path) not in words
-    sizes = {
-        decoded(png).shape
-        for scene in content_of(built.page)[0]["scenes"]
-        for png in (scene["truth"], *scene["images"].values())
-    }
-    assert len(sizes) == 1
+    scenes = content_of(built.page)[0]["scenes"]
+    assert len({decoded(png).shape for each in scenes for png in (each["truth"], *each["images"].values())}) == 1
 
 
 def test_scene_of_one_method_alone_is_left_out_and_incomplete_ones_are_noted(tmp_path, runs, make_run):

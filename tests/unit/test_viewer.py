@@ -14,13 +14,16 @@ from small_results import CAMERA, HOLE, waves
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import triangulate
-from dsr.report.surface_packing import (
+from dsr.report.surface_page import (
     Grid,
+    ViewedResult,
     find_joints,
+    is_view,
     pack_grid,
+    pack_result,
     reduce_depth,
+    save_view,
 )
-from dsr.report.surface_page import ViewedResult, is_view, pack_result, save_view
 
 SPITEFUL = "<img src=x onerror=alert(1)>\"'&</script><script>alert(2)</script>"
 

@@ -19,7 +19,7 @@ import subprocess
 import sys
 import time
 import webbrowser
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Generator, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -46,6 +46,7 @@ _BETWEEN_LOOKS = 0.3  # seconds
 _KEPT = 3600  # seconds for which an upload is kept
 _UNITS = ["mm", "cm", "m", "1/5000", "1/1000", "1/10000", "sunrgbd"]
 _CHOICES = ("--depth-unit", "--range-type", "--baseline", "--fov", "--method", "--fill", "--smooth")
+_Shown = tuple[str, str, str, list[str] | None]  # what was said, the surfaces, the expected errors, and the files
 _PAIR = ("--rgb", "--depth", "--camera", "--mask")
 
 
@@ -93,50 +94,36 @@ def offered() -> list[tuple[str, str]]:
 
 
 class Work:
-    """Runs commands on uploads, in processes with limits, and in a folder that is deleted with its results.
-
-    Args:
-        request: the limits.
-        folder: where uploads and results are.
-
-    """
+    """Runs commands on uploads, in processes with limits, and in a folder that is deleted with its results."""
 
     def __init__(self, request: BrowserRequest, folder: Path) -> None:
         self.request, self._folder = request, folder
         self.process: subprocess.Popen[bytes] | None = None
 
-    def compute(self, *given: Any) -> Iterator[tuple[str, str, str, list[str] | None]]:
-        """Upsample a photo's depth map, or a frame of a capture.
+    def compute(self, *given: Any) -> Iterator[_Shown]:
+        """Upsample a photo's depth map, or a frame of a capture; yield what to show.
 
-        Args:
-            *given: the paths of a capture, a photo, a depth map, a camera and a mask, then the number of the capture's
-                frame from 1, then the values of ``_CHOICES``; empty or None for what is not given.
-
-        Yields:
-            What has been said so far, and in the end the page, the expected errors in Markdown, and the files.
-
+        Given are the paths of a capture, a photo, a depth map, a camera and a mask, the number of the capture's frame
+        from 1, and the values of ``_CHOICES``; empty or None for what is missing.
         """
         capture, frame, pair = given[0], given[5], dict(zip(_PAIR, given[1:5], strict=True))
         if bool(capture) == bool(pair["--rgb"] and pair["--depth"]):
             raise ValueError("expected a photo and a depth map, or a capture")
         options = {**pair, **dict(zip(_CHOICES, given[6:], strict=True))}
         arguments = [f"{flag}={value}" for flag, value in options.items() if value not in (None, "")]
-        text = ""
         with TemporaryDirectory(dir=self._folder) as place:
             result = Path(place) / "dsr-result"
+            upsample = "upsample", f"--output={result.name}"
             if capture:
                 count = "--dry-run", "--shard=1/999999999"  # counts the frames, and reads a sample of them
-                for text in self._run(Path(place), "upsample", capture, *count, f"--output={result.name}"):
-                    yield text, "", "", None
+                text = yield from self._run(Path(place), "", *upsample, capture, *count)
                 found = re.search(r"^(\d+) pairs of photo and depth map$", text, re.MULTILINE)
                 frames = 1 if found is None else int(found[1])
                 if frame not in range(1, frames + 1):
                     raise ValueError(f"frame: expected a number from 1 to {frames}, got {frame}")
                 arguments += [capture, f"--shard={frame}/{frames}"]
-            for text in self._run(Path(place), "upsample", *arguments, f"--output={result.name}"):
-                yield text, "", "", None
-            for _ in self._run(Path(place), "view", result.name, "--no-open"):
-                yield f"{text}preparing the surfaces", "", "", None
+            text = yield from self._run(Path(place), "", *upsample, *arguments)
+            yield from self._run(Path(place), f"{text}preparing the surfaces\n", "view", result.name, "--no-open")
             page = html.escape((result / "view.html").read_text(encoding="utf-8"))
             surfaces = f'<iframe title="the surfaces" sandbox="allow-scripts" srcdoc="{page}"></iframe>'
             archive = shutil.make_archive(str(result), "zip", place, result.name)
@@ -149,8 +136,11 @@ class Work:
             self.process.kill()
             self.process.wait()
 
-    def _run(self, place: Path, *arguments: str) -> Iterator[str]:
-        """Run a command in a folder, and yield what it has said so far; a ValueError with its reason if it fails."""
+    def _run(self, place: Path, before: str, *arguments: str) -> Generator[_Shown, None, str]:
+        """Run a command in a folder, and yield what it has said so far; a ValueError with its reason if it fails.
+
+        ``before`` stands above it. All that the command said is returned in the end.
+        """
         memory = free_memory()
         if self.request.max_memory is not None:
             memory = min(memory, int(1e9 * self.request.max_memory))
@@ -166,9 +156,13 @@ class Work:
                 start_new_session=True,  # Ctrl-C is the server's
             )
         try:
-            _limit(process.pid, memory)
+            with contextlib.suppress(ImportError, AttributeError, ProcessLookupError):  # only Linux has it
+                import resource  # noqa: PLC0415 - Windows has none
+
+                resource.prlimit(process.pid, resource.RLIMIT_DATA, (memory, memory))
+                resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (_LARGEST_FILE, _LARGEST_FILE))
             while process.poll() is None:
-                yield self._said(place)
+                yield before + self._said(place), "", "", None
                 if time.monotonic() > end:
                     limit = self.request.max_seconds
                     raise ValueError(f"it took more than {limit:g} s (--max-seconds), and was ended")
@@ -180,21 +174,12 @@ class Work:
             problems = re.findall(r"^error: (.+)$", text, re.MULTILINE)
             ended = f"the process ended ({process.returncode}); it may need more than {megabytes(memory)} of memory"
             raise ValueError("; ".join(problems) or ended)
-        yield text
+        return text
 
     def _said(self, place: Path) -> str:
         """Return what a command has said so far, without the folders of uploads and results."""
         text = (place / "said.txt").read_text(encoding="utf-8", errors="replace")
         return re.sub(rf"{re.escape(str(self._folder))}{os.sep}(uploads{os.sep})?[^{os.sep}\s]+{os.sep}", "", text)
-
-
-def _limit(process: int, memory: int) -> None:
-    """Limit the memory of a process, and the size of the files that it writes."""
-    with contextlib.suppress(ImportError, AttributeError, ProcessLookupError):  # only Linux has it
-        import resource  # noqa: PLC0415 - Windows has none
-
-        resource.prlimit(process, resource.RLIMIT_DATA, (memory, memory))
-        resource.prlimit(process, resource.RLIMIT_FSIZE, (_LARGEST_FILE, _LARGEST_FILE))
 
 
 def _expected_errors(result: Path) -> str:

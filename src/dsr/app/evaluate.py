@@ -355,8 +355,7 @@ def _illustrate(
     scores: Mapping[str, float],
 ) -> None:
     """Draw the result of a scene, and its expected errors if there are any."""
-    from dsr.pictures.expected_errors import write_confidence  # noqa: PLC0415 - slow to import
-    from dsr.pictures.panels import save_picture  # noqa: PLC0415
+    from dsr.pictures.panels import save_picture, write_confidence  # noqa: PLC0415 - slow to import
 
     save_picture(folder / "pictures" / f"{sample.scene}.png", sample, depth, scores, label, formats)
     if errors is not None:

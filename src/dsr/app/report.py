@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pandas as pd
@@ -11,13 +12,12 @@ from rich.console import Console
 from dsr.app.requests import REPORT_PARTS, LeaderboardRequest, ReportRequest
 from dsr.evaluation.run_files import load_results
 from dsr.notes import expect_no_warning
-from dsr.report.correlation_figure import save_scatter_matrix
-from dsr.report.correlations import write_correlations
+from dsr.report.correlations import save_scatter_matrix, write_correlations
 from dsr.report.figures import Figures
 from dsr.report.page import Pictures, save_page
-from dsr.report.study.study_table import read_study
+from dsr.report.study.percentages import read_study
 from dsr.report.table_layouts import write_tables
-from dsr.report.worker_pool import WorkerPool, default_workers
+from dsr.report.worker_pool import WorkerPool
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import replacing_folder, write_text
 from dsr.utils.progress import Progress
@@ -25,6 +25,8 @@ from dsr.utils.ratios import as_ratio
 
 _MARK = "report.json"
 """A file that marks a directory as a report, which a new one may replace."""
+_FEW = 24  # predictions below which the start of worker processes takes longer than they save
+_MOST = 8  # workers unless more are requested; each needs about 0.5 GB
 _MAIN = {
     "page": "index.html",
     "tables": "tables/all.md",
@@ -47,7 +49,9 @@ def make_report(request: ReportRequest, console: Console) -> list[str]:
     if request.strict:
         expect_no_warning(", ".join(map(str, request.runs)), results.warnings)
     answers = None if request.study is None else read_study(request.study)
-    workers = default_workers(results) if request.workers is None else request.workers
+    predictions = sum(len(run.scenes) for run in results.runs)
+    worth = 1 if predictions < _FEW else min(os.cpu_count() or 1, _MOST)
+    workers = worth if request.workers is None else request.workers
     progress = ConsoleProgress(console)
     with replacing_folder(output) as temporary, WorkerPool(results, workers, progress.say) as pool:
         notes = _write(temporary, pool, answers, request, progress)

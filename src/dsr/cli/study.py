@@ -7,8 +7,7 @@ from rich.console import Console
 from dsr.app.requests import AnswersRequest, StudyRequest
 from dsr.evaluation.run_files import load_results
 from dsr.notes import expect_no_warning
-from dsr.report.study.answers import files_of, read_all
-from dsr.report.study.key import KEY_NAME, read_key
+from dsr.report.study.files import KEY_NAME, files_of, read_all, read_key
 from dsr.report.study.percentages import collect, remarks, tables_of
 from dsr.report.study.questionnaire import build_study
 from dsr.utils.console import ConsoleProgress, show

@@ -218,14 +218,6 @@ class Results:
         """Return the runs of a setting, in order."""
         return [run for run in self.runs if run.problem == problem]
 
-    def by_scene(self, problem: BenchmarkSetting) -> dict[str, list[Run]]:
-        """Return the scenes of a setting with the runs that have a prediction of each, in the order of the runs."""
-        having: dict[str, list[Run]] = {}
-        for run in self.of(problem):
-            for scene in run.scenes:
-                having.setdefault(scene, []).append(run)
-        return having
-
     def only(self, methods: Sequence[str] = (), datasets: Sequence[str] = (), scales: Sequence[float] = ()) -> Results:
         """Return the runs of some methods (by label), data sets and scales; an empty sequence selects all."""
         runs = self.runs
@@ -254,14 +246,6 @@ def alignment_note(runs: Sequence[Run]) -> str:
         if how != "none"
     ]
     return f"{'; '.join(found)}." if found else ""
-
-
-def one_per_method(runs: Sequence[Run]) -> tuple[Run, ...]:
-    """Return the run of each label with the lowest seed, in the order of the labels."""
-    lowest: dict[str, Run] = {}
-    for run in sorted(runs, key=lambda run: run.seed):
-        lowest.setdefault(run.label, run)
-    return tuple(lowest[label] for label in dict.fromkeys(run.label for run in runs))
 
 
 def method_settings(settings: Mapping[str, Any]) -> dict[str, Any]:

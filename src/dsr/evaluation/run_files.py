@@ -120,28 +120,12 @@ def read_run(folder: Path) -> Run:
     dataset = str(scores["dataset"].iloc[0]) if len(scores) else summary.dataset
     scenes = tuple(scene for scene in summary.seconds if prediction_path(folder, scene).is_file())
     scores = scores[scores["scene"].isin(scenes)]
-    return Run(
-        folder,
-        dataset,
-        as_ratio(summary.scale),
-        summary.downsampling,
-        summary.seed,
-        summary.method,
-        summary.label,
-        scores,
-        summary.seconds,
-        settings,
-        versions.model_extra or {},
-        scenes,
-        summary.unanswered,
-        summary.metrics,
-        notes=summary.notes,
-        truths=summary.truths,
-    )
+    own = {"scores": scores, "settings": settings, "versions": versions.model_extra or {}, "scenes": scenes}
+    return Run(folder, **{**dict(summary), "dataset": dataset, "scale": as_ratio(summary.scale), **own})
 
 
 class _Summary(BaseModel, strict=True, allow_inf_nan=False):
-    """The content of ``summary.json``."""
+    """The content of ``summary.json``, by the names of :class:`~dsr.evaluation.results.Run`."""
 
     dataset: str
     scale: Annotated[Number, Field(ge=1, le=_LARGEST_SCALE)]
@@ -150,8 +134,8 @@ class _Summary(BaseModel, strict=True, allow_inf_nan=False):
     seed: Annotated[Whole, Field(ge=0)]
     seconds: dict[str, Annotated[Number, Field(ge=0)]]
     label: str
-    unanswered: dict[str, str] = {}
-    metrics: dict[str, MetricFormat] = {}
+    unsolved: Annotated[dict[str, str], Field(alias="unanswered")] = {}
+    formats: Annotated[dict[str, MetricFormat], Field(alias="metrics")] = {}
     notes: dict[str, list[str]] = {}
     truths: dict[str, str] = {}
 
@@ -201,7 +185,11 @@ def _distinguish(runs: Sequence[Run]) -> list[Run]:
 
     Examples: "MSG-V (ensemble=1)", "middlebury (size=256)".
     """
-    methods = [_identity_of_method(run.settings) for run in runs]
+    methods = [method_settings(run.settings) | {"alignment": run.settings.get("alignment")} for run in runs]
+    for found, run in zip(methods, runs, strict=True):
+        for key, name in (("weights_sha256", "weights"), ("precision", "precision")):
+            if run.settings.get(key) is not None:
+                found[name] = str(run.settings[key])[:_DIGEST]
     datasets = [{**run.settings.get("dataset", {}), "root": None, "scenes": None, "_target_": None} for run in runs]
     labels = _distinguishing_suffixes([(run.label, run.scale) for run in runs], methods)
     names = _distinguishing_suffixes([(run.dataset, 0) for run in runs], datasets)
@@ -241,15 +229,6 @@ def _by_truth(runs: Sequence[Run]) -> list[Run]:
         else run
         for run in runs
     ]
-
-
-def _identity_of_method(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings that distinguish methods of one label: parameters, weights, precision, alignment."""
-    found = method_settings(settings) | {"alignment": settings.get("alignment")}
-    for key, name in (("weights_sha256", "weights"), ("precision", "precision")):
-        if settings.get(key) is not None:
-            found[name] = str(settings[key])[:_DIGEST]
-    return found
 
 
 def _distinguishing_suffixes(names: Sequence[Any], settings: Sequence[Mapping[str, Any]]) -> list[str]:

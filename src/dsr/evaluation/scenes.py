@@ -78,13 +78,6 @@ class Evaluation:
         note = self.method.describe(sample)
         return replace(sample, notes=(*sample.notes, note)) if note else sample
 
-    def stored_config(self, scene: str) -> dict[str, Any]:
-        """Return the settings that a prediction of this scene depends on, as JSON gives them back."""
-        content = self.method.content(self.source.name, scene, self.scale)
-        own = {} if content is None else {"method_content": content}
-        config = {**self.config, "scene": scene, "scene_content": self.source.fingerprint(scene), **own}
-        return dict(json.loads(json.dumps(config)))
-
 
 @dataclass
 class SceneResult:
@@ -109,7 +102,10 @@ def evaluate_scene(study: Evaluation, scene: str, since: float = -math.inf, prog
     path = prediction_path(study.folder, scene)
     try:
         with refusing_excess():
-            config = study.stored_config(scene)
+            content = study.method.content(study.source.name, scene, study.scale)
+            own = {} if content is None else {"method_content": content}
+            config = {**study.config, "scene": scene, "scene_content": study.source.fingerprint(scene), **own}
+            config = json.loads(json.dumps(config))  # as a stored one comes back
             result.reused = path.is_file() and path.stat().st_mtime > since
             result.seconds = (
                 _stored_seconds(path, config) if result.reused else _predict(study, scene, config, progress)

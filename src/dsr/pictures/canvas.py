@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import gc
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import matplotlib as mpl
@@ -32,6 +30,21 @@ _PNG_LEVEL = 6
 _HEIGHT, _WIDTH, _GAP = 220, 320, 6
 """Pixels: the panels' largest size, and what lies between them."""
 _QUALITY = 85
+
+
+class Part(NamedTuple):
+    """A rectangle of a picture in relative coordinates: 0 is the left or upper edge, 1 the right or lower edge."""
+
+    left: float
+    right: float
+    top: float
+    bottom: float
+
+    def of(self, place: Bbox) -> Bbox:
+        """Return where the part is of a picture that is drawn at a place."""
+        x0, x1 = (place.x0 + at * place.width for at in (self.left, self.right))
+        y1, y0 = (place.y1 - at * place.height for at in (self.top, self.bottom))
+        return Bbox.from_extents(x0, y0, x1, y1)
 
 
 def colours(name: str | Colormap) -> Any:
@@ -96,24 +109,51 @@ class Canvas:
         self._pictures.add_patch(Rectangle(place.p0, place.width, place.height, label=label, **style))
 
 
-def fitted(space: Bbox, aspect: float) -> Bbox:
-    """Return the largest rectangle of a ratio of height to width in the middle of a space."""
-    width = min(space.width, space.height / aspect)
-    height = width * aspect
-    left, bottom = (space.x0 + space.x1 - width) / 2, (space.y0 + space.y1 - height) / 2
-    return Bbox.from_bounds(left, bottom, width, height)
+class Panels(Canvas):
+    """Rows of panels, in the middle of which stand pictures of one ratio of height to width; all lengths in inches."""
 
+    def __init__(
+        self,
+        shape: tuple[int, int],  # number of rows and columns
+        aspect: float,  # of the pictures
+        size: tuple[float, float],  # width and height of a panel
+        across: tuple[float, float],  # left of the first column, and right of each one
+        down: tuple[float, float, float],  # above the first row, between rows, and below the last one
+    ) -> None:
+        (rows, columns), self._aspect, (self._width, self._height) = shape, aspect, size
+        (self._left, self._gap), (self._above, self._between, below) = across, down
+        height = self._above + rows * self._height + (rows - 1) * self._between + below
+        super().__init__(self._left + columns * (self._width + self._gap), height)
 
-@contextlib.contextmanager
-def without_collections() -> Iterator[None]:
-    """Leave garbage alone within the context: Matplotlib makes so many objects that to go through them takes long."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
+    def space(self, row: int, column: int) -> Bbox:
+        """Return the space of a panel."""
+        top = self.figure.get_figheight() - self._above - row * (self._height + self._between)
+        left = self._left + column * (self._width + self._gap)
+        return Bbox.from_bounds(left, top - self._height, self._width, self._height)
+
+    def place(self, row: int, column: int) -> Bbox:
+        """Return where the picture of a panel is."""
+        space = self.space(row, column)
+        width = min(space.width, space.height / self._aspect)
+        height = width * self._aspect
+        left, bottom = (space.x0 + space.x1 - width) / 2, (space.y0 + space.y1 - height) / 2
+        return Bbox.from_bounds(left, bottom, width, height)
+
+    def panel(self, row: int, column: int, picture: np.ndarray, title: str, **style: Any) -> AxesImage:
+        """Draw a picture below its title."""
+        place = self.place(row, column)
+        self.text((place.x0 + place.x1) / 2, place.y1 + 0.08, title, fontsize=12, ha="center")
+        return self.show(place, picture, **{"interpolation": "nearest", **style})
+
+    def bar_below(
+        self, image: AxesImage, row: int, columns: tuple[int, int], label: str, extend: str, height: float = 0.09
+    ) -> None:
+        """Draw a colour bar below the panels from one column to another."""
+        left, right = self.space(row, columns[0]).x0, self.space(row, columns[1]).x1
+        width = min(right - left, 1.6 * self._width) - 0.2 * self._width
+        below = self.place(row, columns[1]).y0
+        place = Bbox.from_bounds((left + right - width) / 2, below - 0.1 - height, width, height)
+        self.bar(image, place, extend=extend, orientation="horizontal").set_label(label, labelpad=1)
 
 
 def save_both(folder: Path, name: str, figure: Figure) -> list[Path]:
@@ -171,11 +211,15 @@ def encode_row(panels: Sequence[np.ndarray]) -> bytes:
     return content.tobytes()
 
 
+def with_holes(picture: np.ndarray) -> np.ndarray:
+    """Return an (H, W, 3) picture with the pixels that are not finite in the hole colour."""
+    known = np.isfinite(picture).all(axis=2, keepdims=True)
+    return np.where(known, picture, np.array(colours("gray").get_bad()[:3], picture.dtype))
+
+
 def _resized(panel: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Return a panel as RGBA of a width and height."""
-    colour = np.repeat(panel[..., None], 3, axis=2) if panel.ndim == 2 else panel
-    holes = ~np.isfinite(colour).all(axis=2, keepdims=True)
-    pixels: Any = np.where(holes, colours("gray").get_bad()[:3], colour).astype(np.float32)
+    pixels: Any = with_holes(np.repeat(panel[..., None], 3, axis=2) if panel.ndim == 2 else panel).astype(np.float32)
     smaller = size[0] < pixels.shape[1]
     pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_NEAREST)
     known = np.full((size[1], size[0], 1), 255, np.uint8)

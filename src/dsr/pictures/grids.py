@@ -12,7 +12,7 @@ from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
-from dsr.pictures.canvas import Canvas
+from dsr.pictures.canvas import Canvas, Part
 from dsr.pictures.depth_views import Window
 
 FRAMES = ("#ff8c00", "#00a5e3")
@@ -115,13 +115,16 @@ class _Page(Canvas):
             middle = ((place.x0 + place.x1) / 2, (place.y0 + place.y1) / 2)
             self.text(*middle, cell.caption, ha="center", va="center", color="0.45")
             return
-        self._show(place, cell, cell.picture, f"{row.label}: panel")
+        style: dict[str, Any] = {"colour_map": cell.colour_map, "limits": cell.limits}
+        self.show(place, cell.picture, f"{row.label}: panel", **style)
         size = below - _SEAM
         for number, (window, colour) in enumerate(zip(row.details, FRAMES, strict=False)):
-            frame = _part_of(place, window, cell.picture.shape)
-            self.frame(frame, f"{row.label}: frame", facecolor="none", edgecolor=colour, linewidth=0.9)
+            down, across = cell.picture.shape[:2]
+            right, bottom = (window.left + window.width) / across, (window.top + window.height) / down
+            part = Part(window.left / across, right, window.top / down, bottom)
+            self.frame(part.of(place), f"{row.label}: frame", facecolor="none", edgecolor=colour, linewidth=0.9)
             inset = Bbox.from_bounds(left + number * (size + _SEAM), top - height - below, size, size)
-            self._show(inset, cell, cell.picture[window.slices], f"{row.label}: detail")
+            self.show(inset, cell.picture[window.slices], f"{row.label}: detail", **style)
             self.frame(inset, f"{row.label}: edge", facecolor="none", edgecolor=colour, linewidth=1.0)
         self.text(left + panel / 2, top - height - below - 0.02, cell.caption, ha="center", va="top",
                   weight="bold" if cell.bold else "normal")  # fmt: skip
@@ -137,18 +140,3 @@ class _Page(Canvas):
         bar.outline.set_linewidth(0.4)
         bar.ax.tick_params(labelsize=_FONT - 1, length=2, width=0.4, pad=1.5)
         bar.set_label(row.bar, fontsize=_FONT, labelpad=1.5)
-
-    def _show(self, place: Bbox, cell: Cell, picture: np.ndarray, label: str) -> None:
-        """Draw a picture."""
-        self.show(place, picture, label, colour_map=cell.colour_map, limits=cell.limits)
-
-
-def _part_of(place: Bbox, window: Window, shape: tuple[int, ...]) -> Bbox:
-    """Return where a window of a picture of (height, width) pixels is that is shown at ``place``."""
-    across, down = place.width / shape[1], place.height / shape[0]
-    return Bbox.from_bounds(
-        place.x0 + across * window.left,
-        place.y1 - down * (window.top + window.height),
-        across * window.width,
-        down * window.height,
-    )

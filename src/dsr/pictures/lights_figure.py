@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from torch import Tensor
 
 from dsr.geometry.lights import LIGHTS, Direction
 from dsr.geometry.surface import render
@@ -43,7 +42,11 @@ def save_lights_figure(folder: Path, scene: DepthSample | None = None) -> list[P
 
     upper = height - _ABOVE - _PANEL
     _draw_frame(axes(_MARGIN, upper + (_PANEL - _AXES) / 2, _AXES, _AXES, "camera frame"))
-    sphere = render(sphere_normals(_SPHERE)[None])[0].numpy()
+    ramp = torch.linspace(-1, 1, _SPHERE, dtype=torch.float64)
+    y, x = torch.meshgrid(ramp, ramp, indexing="ij")
+    square = 1 - x.square() - y.square()
+    normals = torch.where(square >= 0, torch.stack((x, y, -square.clamp(min=0).sqrt())), torch.nan)
+    sphere = render(normals[None])[0].numpy()  # in orthographic projection
     for number, (name, light) in enumerate(LIGHTS.items()):
         left = _MARGIN + _AXES + number * (_PANEL + _GAP) + _GAP
         panel = axes(left, upper, _PANEL, _PANEL, f"sphere under {name}")
@@ -56,17 +59,6 @@ def save_lights_figure(folder: Path, scene: DepthSample | None = None) -> list[P
             shades = rendering(scene.depth, scene.camera, name)
             surface.imshow(shades, cmap=colours("gray"), vmin=0, vmax=1, aspect="auto")
     return save_both(folder, "lights", figure)
-
-
-def sphere_normals(size: int) -> Tensor:
-    """Return the normals of a sphere in orthographic projection, (3, size, size), NaN outside it.
-
-    n = (x, y, -sqrt(1 - x^2 - y^2)) with x and y from -1 to 1.
-    """
-    ramp = torch.linspace(-1, 1, size, dtype=torch.float64)
-    y, x = torch.meshgrid(ramp, ramp, indexing="ij")
-    square = 1 - x.square() - y.square()
-    return torch.where(square >= 0, torch.stack((x, y, -square.clamp(min=0).sqrt())), torch.nan)
 
 
 def _draw_sphere(axes: Axes, shades: np.ndarray, direction: Direction) -> None:

@@ -82,23 +82,26 @@ def save_contact_sheet(path: Path, scenes: Iterable[Scene], title: str) -> list[
 def _row(scene: Scene) -> _Row:
     """Collect what a sheet shows of a scene."""
     depth, camera, what = _shown_map(scene)
+    view = scene.camera
+    axes = ((view.width, view.fx, view.cx), (view.height, view.fy, view.cy))
+    angles = (math.atan((at + 0.5) / f) + math.atan((size - 0.5 - at) / f) for size, f, at in axes)  # to the edges
     valid = depth[depth.isfinite()]
     missing_fraction = 1 - valid.numel() / depth.numel()
     lines = [
         *textwrap.wrap(scene.name, _LETTERS, break_on_hyphens=False),
         "",
         *textwrap.wrap(scene.dataset, _LETTERS, break_on_hyphens=False),
-        f"{scene.camera.width} x {scene.camera.height} pixels",
-        "field of view {:.0f} x {:.0f} degrees".format(*_field_of_view(scene.camera)),
+        f"{view.width} x {view.height} pixels",
+        "field of view {:.0f} x {:.0f} degrees".format(*map(math.degrees, angles)),
         *what,
         f"depth {float(valid.min()):.3g} to {float(valid.max()):.3g} m",
-        f"holes: {_percent(missing_fraction)}",
+        f"holes: {100 * missing_fraction:.3g} %" if missing_fraction else "holes: none",
     ]
     large_enough = min(depth.shape[-2:]) >= 2
     shades = render(normals_seen_by(camera, depth))[0] if large_enough else torch.full((4, 2, 2), torch.nan)
     return _Row(
         "\n".join(lines),
-        (scene.camera.height, scene.camera.width),
+        (view.height, view.width),
         _reduced(scene.rgb).permute(1, 2, 0).clamp(0, 1).numpy(),
         _reduced(depth)[0].numpy(),
         limits_of(depth),
@@ -121,18 +124,6 @@ def _shown_map(scene: Scene) -> tuple[Tensor, Camera, list[str]]:
         scene.camera.reduce(width, height),
         [f"measured: {measured}; no high-resolution depth", f"shown: x{round_ratio(ratio)}, {width} x {height}"],
     )
-
-
-def _field_of_view(camera: Camera) -> tuple[float, float]:
-    """Return the horizontal and vertical field of view in degrees, between the outer edges of the pixels."""
-    axes = ((camera.width, camera.fx, camera.cx), (camera.height, camera.fy, camera.cy))
-    across, down = (math.atan((at + 0.5) / f) + math.atan((size - 0.5 - at) / f) for size, f, at in axes)
-    return math.degrees(across), math.degrees(down)
-
-
-def _percent(fraction: float) -> str:
-    """Format a fraction as a percentage; a small fraction is not rounded to 0."""
-    return "none" if fraction == 0 else f"{100 * fraction:.3g} %"
 
 
 def _reduced(values: Tensor) -> Tensor:
@@ -182,7 +173,7 @@ def _draw_row(page: Canvas, row: _Row, top: float, size: tuple[float, float]) ->
     bar.ax.tick_params(labelsize=8, pad=1.5, length=2)
     known, hole = (np.array(to_rgb(colour)) for colour in (_VALID_COLOUR, HOLE_COLOUR))
     page.show(holes, known + row.missing[..., None] * (hole - known))
-    caption = f"{_percent(row.missing_fraction)} missing" if row.missing_fraction else "complete"
+    caption = f"{100 * row.missing_fraction:.3g} % missing" if row.missing_fraction else "complete"
     page.text((holes.x0 + holes.x1) / 2, holes.y0 - 0.06, caption, ha="center", va="top", fontsize=9)
     across, down = (width - _SEAM) / 2, (height - _SEAM) / 2
     for number, (light, shades) in enumerate(zip(LIGHT_NAMES, row.renderings, strict=True)):

@@ -10,17 +10,17 @@ from __future__ import annotations
 
 import functools
 import math
-import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.colors import ListedColormap
+from torch import Tensor
 
-from dsr.evaluation.results import BenchmarkSetting, Results, Run, sample_path
+from dsr.evaluation.results import BenchmarkSetting, Results
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import FIGURE_LIGHT
 from dsr.metrics.catalogue import KNOWN_FORMATS
@@ -28,10 +28,10 @@ from dsr.pictures.canvas import save_both
 from dsr.pictures.depth_views import Window, limits_of, rendering, strongest_window
 from dsr.pictures.grids import Cell, Row, draw_grid
 from dsr.pictures.lights_figure import save_lights_figure
-from dsr.report.shown_scenes import Shown, shown_of, stored_sample, views_of
+from dsr.report.shown_scenes import Shown, shown_of, views_of
+from dsr.report.tables import unique_name
 from dsr.report.worker_pool import WorkerPool
 from dsr.sample import DepthSample
-from dsr.utils.arrays import array_headers
 
 ROWS = 5
 """Maximum number of scenes on a page."""
@@ -52,8 +52,8 @@ class Figures:
     def __init__(self, folder: Path, workers: WorkerPool, light: str = FIGURE_LIGHT) -> None:
         self.notes: list[str] = []
         """One line per scene or result that could not be drawn."""
-        self._pages = [*pages_of(workers.results, KINDS, light, self.notes), None]
-        self._drawn = workers.map(functools.partial(_draw, folder), self._pages)
+        self._pages = [*pages_of(workers.results, KINDS, light), None]
+        self._drawn = workers.map(functools.partial(draw_page, folder), self._pages)
 
     def save(self, progress: Callable[[int, int, str], None] | None = None) -> list[Path]:
         """Return the files once they are drawn; ``progress`` is told the number done, of all, and the figure's name."""
@@ -67,15 +67,6 @@ class Figures:
         return paths
 
 
-def _draw(folder: Path, results: Results, page: Page | None) -> tuple[list[Path], list[str]]:
-    """Draw a page, or the figure of the lights for None; return the files and notes on what could not be drawn."""
-    notes: list[str] = []
-    paths = (
-        save_lights_figure(folder, _most_varied(results)) if page is None else save_page(folder, results, page, notes)
-    )
-    return paths, notes
-
-
 @dataclass(frozen=True)
 class Page:
     """A page of a grid."""
@@ -87,98 +78,64 @@ class Page:
     light: str  # of the renderings
 
 
-def pages_of(results: Results, kinds: Iterable[str], light: str, notes: list[str]) -> list[Page]:
-    """Return the pages of some kinds of grids, from the names of the files alone; ``notes`` takes what is left out."""
+def pages_of(results: Results, kinds: Iterable[str], light: str) -> list[Page]:
+    """Return the pages of some kinds of grids."""
     found = []
-    problems = results.problems()
     for kind in kinds:
-        for problem, name in zip(problems, _names(problems), strict=True):
-            scenes = []
-            for view in views_of(results, problem):
-                stored = next((run for run in view.runs if run.has_sample(view.scene)), None)
-                if stored is None:
-                    stored_sample(view, notes)
-                elif kind != "errors" or _has_truth(stored, view.scene):
-                    scenes.append(view.scene)
+        names: set[str] = set()
+        for problem in results.problems():
+            name = unique_name("{}_x{}_{}".format(*problem), names)
+            scenes = [view.scene for view in views_of(results, problem)]
             for number, start in enumerate(range(0, len(scenes), ROWS), start=1):
                 rows = tuple(scenes[start : start + ROWS])
                 found.append(Page(kind, problem, f"{kind}_{name}_{number}", rows, light))
     return found
 
 
-def _has_truth(run: Run, scene: str) -> bool:
-    """Return whether a stored scene has ground truth; a damaged one may have it elsewhere."""
-    try:
-        return "depth" in array_headers(sample_path(run.folder, scene))
-    except (ValueError, OSError):
-        return True
-
-
-def save_page(folder: Path, results: Results, page: Page, notes: list[str]) -> list[Path]:
-    """Draw a page, unless none of its scenes can be drawn, and return its PDF and PNG; ``notes`` takes the reasons."""
-    kind = _GRIDS[page.kind]
+def draw_page(folder: Path, results: Results, page: Page | None) -> tuple[list[Path], list[str]]:
+    """Draw a page, or the figure of the lights for None; return its PDF and PNG, and notes on what cannot be drawn."""
+    notes: list[str] = []
+    if page is None:
+        return save_lights_figure(folder, _most_varied(results)), notes
+    make_row, below = _GRIDS[page.kind]
     methods = list(dict.fromkeys(run.label for run in results.of(page.problem)))
     rows = []
     for view in views_of(results, page.problem):
         shown = shown_of(view, methods, notes) if view.scene in page.scenes else None
-        row = None if shown is None else kind.row(shown, page.light)
+        row = None if shown is None else make_row(shown, page.light)
         if row is not None:
             rows.append(row)
     if not rows:
-        return []
-    columns = (*kind.before, *methods, *kind.after)
+        return [], notes
+    columns = ["photo", *methods] if page.kind == "errors" else ["photo", "input", *methods, "truth"]
     title = f"{page.problem.dataset}, x{page.problem.scale}, {page.problem.downsampling}"
     pictures = (cell.picture for row in rows for cell in row.cells if cell.picture is not None)
     holes = "; pink: holes" if any(not np.isfinite(picture).all() for picture in pictures) else ""
-    below = kind.below.format(light=page.light) + holes
-    return save_both(folder, page.name, draw_grid(columns, rows, (title, below)))
-
-
-def _names(problems: list[BenchmarkSetting]) -> list[str]:
-    """Return a unique part of a file name for each benchmark setting."""
-    names: list[str] = []
-    for dataset, scale, downsampling in problems:
-        name = re.sub(r"[^\w.-]+", "_", f"{dataset}_x{scale}_{downsampling}").strip("_")
-        while name in names:
-            name += "_"
-        names.append(name)
-    return names
+    return save_both(folder, page.name, draw_grid(columns, rows, (title, below.format(page.light) + holes))), notes
 
 
 def rendering_row(shown: Shown, light: str) -> Row:
     """Build the row of a scene's renderings."""
     scene = shown.scene
-    results = {
-        label: None if depth is None else rendering(depth, scene.camera, light) for label, depth in shown.depths.items()
-    }
-    truth = None if scene.depth is None else rendering(scene.depth, scene.camera, light)
-    scores = _captions(shown, "DSSIM_v", "RMSE_v")
-    cells = [
-        _photo(scene),
-        Cell(_enlarge(rendering(scene.depth_lr, scene.camera_lr, light), scene.camera)),
-        *(_panel(picture, scores[label]) for label, picture in results.items()),
-        _panel(truth, missing="no truth"),
-    ]
-    drawn = [picture for picture in results.values() if picture is not None]
-    return _row(shown, cells, details=details_of(drawn, truth, math.ceil(scene.scale)))
+    drawn = {label: _drawn(depth, scene.camera, light) for label, depth in shown.depths.items()}
+    truth = _drawn(scene.depth, scene.camera, light)
+    results = [picture for picture in drawn.values() if picture is not None]
+    details = details_of(results, truth, math.ceil(scene.scale))
+    around = rendering(scene.depth_lr, scene.camera_lr, light), truth
+    return _row(shown, drawn, ("DSSIM_v", "RMSE_v"), around, details=details)
+
+
+def _drawn(depth: Tensor | None, camera: Camera, light: str) -> np.ndarray | None:
+    return None if depth is None else rendering(depth, camera, light)
 
 
 def depth_row(shown: Shown, _: str) -> Row:
     """Build the row of a scene's depth maps."""
     scene = shown.scene
-    style: dict[str, Any] = {
-        "colour_map": "viridis",
-        "limits": limits_of(scene.depth_lr if scene.depth is None else scene.depth),
-    }
-    scores = _captions(shown, "RMSE_d")
+    style = {"colour_map": "viridis", "limits": limits_of(scene.depth_lr if scene.depth is None else scene.depth)}
     pixels = {label: None if depth is None else depth[0].numpy() for label, depth in shown.depths.items()}
-    cells = [
-        _photo(scene),
-        Cell(_enlarge(scene.depth_lr[0].numpy(), scene.camera), **style),
-        *(_panel(picture, scores[label], **style) for label, picture in pixels.items()),
-        _panel(None if scene.depth is None else scene.depth[0].numpy(), missing="no truth", **style),
-    ]
-    return _row(shown, cells, bar="depth, m", extend="both")
+    around = scene.depth_lr[0].numpy(), None if scene.depth is None else scene.depth[0].numpy()
+    return _row(shown, pixels, ("RMSE_d",), around, style, bar="depth, m", extend="both")
 
 
 def error_row(shown: Shown, _: str) -> Row | None:
@@ -192,55 +149,51 @@ def error_row(shown: Shown, _: str) -> Row | None:
     factor, unit = (100, "cm") if limit >= _CENTIMETRE_LIMIT else (1000, "mm")
     # From blue over white to red, without the nearly black ends
     colour_map = ListedColormap(mpl.colormaps["RdBu_r"](np.linspace(0.1, 0.9, 255)), "errors")
-    style: dict[str, Any] = {"colour_map": colour_map, "limits": (-factor * limit, factor * limit)}
-    scores = _captions(shown, "RMSE_d")
-    cells = [_photo(shown.scene)]
-    for label, error in errors.items():
-        cells.append(_panel(None if error is None else factor * error, scores[label], **style))
-    return _row(shown, cells, bar=f"result - truth, {unit}", extend="both")
+    style = {"colour_map": colour_map, "limits": (-factor * limit, factor * limit)}
+    scaled = {name: None if error is None else factor * error for name, error in errors.items()}
+    return _row(shown, scaled, ("RMSE_d",), None, style, bar=f"result - truth, {unit}", extend="both")
 
 
-class _Grid(NamedTuple):
-    """A kind of grid: what makes its rows, its columns before and after the methods, and the text below."""
-
-    row: Callable[[Shown, str], Row | None]
-    before: tuple[str, ...]
-    after: tuple[str, ...]
-    below: str
-
-
-_GRIDS = {
-    "renderings": _Grid(
-        rendering_row,
-        ("photo", "input"),
-        ("truth",),
-        "surfaces lit by {light}; below: DSSIM_v / RMSE_v, 1/1000, lower is better",
-    ),
-    "depth": _Grid(
-        depth_row, ("photo", "input"), ("truth",), "distance to the image plane; below: RMSE_d, mm, lower is better"
-    ),
-    "errors": _Grid(
-        error_row, ("photo",), (), "result - truth: red is too far, blue too near; below: RMSE_d, mm, lower is better"
-    ),
+_GRIDS: dict[str, tuple[Callable[[Shown, str], Row | None], str]] = {
+    "renderings": (rendering_row, "surfaces lit by {}; below: DSSIM_v / RMSE_v, 1/1000, lower is better"),
+    "depth": (depth_row, "distance to the image plane; below: RMSE_d, mm, lower is better"),
+    "errors": (error_row, "result - truth: red is too far, blue too near; below: RMSE_d, mm, lower is better"),
 }
+"""What makes a row, and the text below, of each kind of grid."""
 KINDS = tuple(_GRIDS)
 
 
-def _row(shown: Shown, cells: Sequence[Cell], **more: Any) -> Row:
-    """Build a row; the name of the scene has spaces, at which it can be wrapped."""
-    camera = shown.scene.camera
+def _row(
+    shown: Shown,
+    pictures: Mapping[str, np.ndarray | None],
+    metrics: Sequence[str],
+    around: tuple[np.ndarray, np.ndarray | None] | None,
+    style: Mapping[str, Any] | None = None,
+    **more: Any,
+) -> Row:
+    """Build a row: the photo, and the pictures of the methods above their scores, ``around`` them input and truth.
+
+    The captions have the scores in the paper's units, in bold for the best by the first metric. The name of the scene
+    has spaces, at which it can be wrapped.
+    """
+    camera, style = shown.scene.camera, style or {}
+    cells = [Cell(shown.scene.rgb.permute(1, 2, 0).clamp(0, 1).numpy())]
+    if around is not None:
+        cells.append(Cell(_enlarge(around[0], camera), **style))
+    first = {label: scores.get(metrics[0], math.nan) for label, scores in shown.scores.items()}
+    valid = [value for value in first.values() if math.isfinite(value)]
+    best = min(valid) if len(valid) > 1 else None
+    for label, picture in pictures.items():
+        texts = []
+        for metric in metrics:
+            value = KNOWN_FORMATS[metric].factor * shown.scores[label].get(metric, math.nan)
+            texts.append(KNOWN_FORMATS[metric].text(value) if math.isfinite(value) else "-")
+        caption = " / ".join(texts) if set(texts) != {"-"} else ""
+        missing = Cell(None, "no result")
+        cells.append(missing if picture is None else Cell(picture, caption, first[label] == best, **style))
+    if around is not None:
+        cells.append(Cell(None, "no truth") if around[1] is None else Cell(around[1], **style))
     return Row(shown.name.replace("_", " "), camera.height / camera.width, cells, **more)
-
-
-def _photo(scene: DepthSample) -> Cell:
-    return Cell(scene.rgb.permute(1, 2, 0).clamp(0, 1).numpy())
-
-
-def _panel(
-    picture: np.ndarray | None, caption: tuple[str, bool] = ("", False), *, missing: str = "no result", **style: Any
-) -> Cell:
-    """Build a panel of (H, W) values, or a panel with the text ``missing``."""
-    return Cell(None, missing) if picture is None else Cell(picture, *caption, **style)
 
 
 def _enlarge(picture: np.ndarray, camera: Camera) -> np.ndarray:
@@ -250,23 +203,6 @@ def _enlarge(picture: np.ndarray, camera: Camera) -> np.ndarray:
         for old, new in zip(picture.shape, (camera.height, camera.width), strict=True)
     )
     return picture[rows[:, None], columns]
-
-
-def _captions(shown: Shown, *metrics: str) -> dict[str, tuple[str, bool]]:
-    """Format the scores of each method in the paper's units, and determine whether the first is the best."""
-    captions: dict[str, tuple[str, bool]] = {}
-    first = {label: scores.get(metrics[0], math.nan) for label, scores in shown.scores.items()}
-    valid = [value for value in first.values() if math.isfinite(value)]
-    best = min(valid) if len(valid) > 1 else None
-    for label, scores in shown.scores.items():
-        values = [KNOWN_FORMATS[name].factor * scores.get(name, math.nan) for name in metrics]
-        texts = [
-            KNOWN_FORMATS[name].text(value) if math.isfinite(value) else "-"
-            for name, value in zip(metrics, values, strict=True)
-        ]
-        shown_text = "" if all(text == "-" for text in texts) else " / ".join(texts)
-        captions[label] = (shown_text, first[label] == best)
-    return captions
 
 
 def details_of(pictures: Sequence[np.ndarray], truth: np.ndarray | None, grain: int, count: int = 2) -> list[Window]:
@@ -307,5 +243,5 @@ def _most_varied(results: Results) -> DepthSample | None:
 
 def _variety(scene: DepthSample) -> float:
     """Return the standard deviation of the brightness under the light of figures."""
-    values = rendering(scene.depth, scene.camera) if scene.depth is not None else np.zeros(1)
-    return float(np.nan_to_num(np.nanstd(values)))
+    shades = _drawn(scene.depth, scene.camera, FIGURE_LIGHT)
+    return 0.0 if shades is None else float(np.nan_to_num(np.nanstd(shades)))

@@ -67,16 +67,13 @@ def published() -> pd.DataFrame:
 
 def published_row(scene: str, method: str, scale: float) -> pd.Series | None:
     """Return the paper's values for a scene (by our name or the paper's) and a method (by its name in the paper)."""
-    number = _published_places().get((scene.replace("_", " ").casefold(), method, scale))
-    return None if number is None else published().iloc[number]
+    return _published_rows().get((scene.replace("_", " ").casefold(), method, scale))
 
 
 @functools.cache
-def _published_places() -> dict[tuple[str, str, float], int]:
-    """Return the row number in :func:`published` by scene, method and scale."""
-    table = published()
-    keys = zip(table["scene"].str.casefold(), table["method"], table["scale"], strict=True)
-    return {(scene, method, int(scale)): number for number, (scene, method, scale) in enumerate(keys)}
+def _published_rows() -> dict[tuple[str, str, float], pd.Series]:
+    """Return the rows of :func:`published` by scene, method and scale."""
+    return {(row["scene"].casefold(), row["method"], int(row["scale"])): row for _, row in published().iterrows()}
 
 
 def applies(runs: Iterable[Run], scenes: Iterable[str]) -> bool:
@@ -150,7 +147,11 @@ def sets_of_dataset(places: Sequence[Place]) -> list[SceneSet]:
     """Return each scene of a data set, then their averages if there are at least two scenes."""
     dataset = places[0].dataset
     averages = _averages_of_dataset(dataset, places) if len(places) > 1 else []
-    return [*map(_single, places), *averages]
+    single = []
+    for place in places:  # one of an unlisted data set may be a file of the paper in a user's folder
+        in_paper = dataset not in PAPER_SCENES or place.scene in PAPER_FILES.get(dataset, ())
+        single.append(SceneSet(place.scene, (place,), place.scene if in_paper else "", average=False))
+    return [*single, *averages]
 
 
 def sets_of_summary(
@@ -179,13 +180,6 @@ def sets_of_summary(
 
 def _within(places: Sequence[Place], dataset: str) -> list[Place]:
     return [place for place in places if place.dataset == dataset]
-
-
-def _single(place: Place) -> SceneSet:
-    """Return a set of one scene; a scene of an unlisted data set may be a file of the paper in a user's folder."""
-    dataset, scene = place
-    in_paper = dataset not in PAPER_SCENES or scene in PAPER_FILES.get(dataset, ())
-    return SceneSet(scene, (place,), scene if in_paper else "", average=False)
 
 
 def _of_paper(places: Sequence[Place], dataset: str) -> list[Place]:

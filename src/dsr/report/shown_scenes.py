@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from dsr.evaluation.results import BenchmarkSetting, Results, Run, one_per_method
+from dsr.evaluation.results import BenchmarkSetting, Results, Run
 from dsr.sample import DepthSample
 
 
@@ -35,7 +35,12 @@ class Result:
 
 def views_of(results: Results, problem: BenchmarkSetting) -> list[View]:
     """Return the scenes of a setting that have predictions."""
-    return [View(problem, scene, one_per_method(runs)) for scene, runs in results.by_scene(problem).items()]
+    found: dict[str, dict[str, Run]] = {}
+    for run in results.of(problem):
+        for scene in run.scenes:
+            lowest = found.setdefault(scene, {})
+            lowest[run.label] = min(lowest.get(run.label, run), run, key=lambda each: each.seed)
+    return [View(problem, scene, tuple(runs.values())) for scene, runs in found.items()]
 
 
 def stored_sample(view: View, notes: list[str]) -> DepthSample | None:
@@ -96,9 +101,4 @@ def shown_of(view: View, methods: Sequence[str], notes: list[str]) -> Shown | No
         return None
     depths = {each.run.label: each.depth for each in results_of(view, stored, notes)}
     scores = {run.label: run.headlines.get(view.scene, {}) for run in view.runs}
-    return Shown(
-        view.scene,
-        stored,
-        {label: depths.get(label) for label in methods},
-        {label: scores.get(label, {}) for label in methods},
-    )
+    return Shown(view.scene, stored, dict.fromkeys(methods) | depths, {label: {} for label in methods} | scores)

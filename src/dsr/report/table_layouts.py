@@ -120,7 +120,7 @@ def to_markdown(table: PaperTable) -> str:
         "\n".join(f"- {escaped(note)}" for note in table.notes),
     ]
     if table.has_published:
-        columns = table.published_columns()
+        columns = table.published_columns
         rows = [row for group in table.groups for row in _compared(words, columns, group)]
         head = [*(fact.name for fact in words), "", *(escaped(each.title) for each in columns.values())]
         parts += [f"### {escaped(table.title)}, beside the paper", aligned(head, rows, len(words) + 1)]
@@ -162,9 +162,38 @@ def to_latex(table: PaperTable, *, published: bool = False) -> str:
     A table is at most as wide as the text. A table too long for a page is split. A ``published`` one has the paper's
     values in parentheses, and no spreads and intervals.
     """
-    groups = [list(_latex_rows(table, group, published=published)) for group in table.groups]
-    pages = list(_pages([rows for rows in groups if rows]))
-    return "\n".join(_page(table, page, number, published) for number, page in enumerate(pages))
+    facts, columns = table.facts, table.columns
+    if published:
+        facts, columns = [fact for fact in facts if not fact.number], table.published_columns
+    title = table.title + (", beside the paper's values (in parentheses)" if published else "")
+    kinds = "".join("r" if fact.number else "l" for fact in facts) + "r" * len(columns)
+    head = [fact.name.capitalize() for fact in facts]
+    for column in columns.values():
+        name, _, index = column.heading.partition("_")
+        head.append(latex_text(name) + (f"$_{{{latex_text(index)}}}$" if index else ""))
+    units = [*("" for _ in facts), *(latex_text(column.unit) for column in columns.values())]
+    groups = [list(_latex_rows(group, facts, columns, published=published)) for group in table.groups]
+    texts: list[str] = []
+    for page in _pages([rows for rows in groups if rows]):
+        caption = f"{title}, continued." if texts else f"{title}. {' '.join(table.notes)}"
+        body = "\n\\midrule\n".join("\n".join(rows) for rows in page)
+        texts.append(rf"""\begin{{table}}[htbp]
+\centering
+\caption{{{latex_text(caption)}}}
+\smallskip
+\resizebox{{\ifdim\width>\linewidth \linewidth\else\width\fi}}{{!}}{{%
+\begin{{tabular}}{{@{{}}{kinds}@{{}}}}
+\toprule
+{" & ".join(head)} \\
+{" & ".join(units)} \\
+\midrule
+{body}
+\bottomrule
+\end{{tabular}}%
+}}
+\end{{table}}
+""")
+    return "\n".join(texts)
 
 
 def aligned(head: Sequence[str], rows: Sequence[Sequence[str]], texts: int) -> str:
@@ -198,34 +227,56 @@ def latex_text(text: str) -> str:
 
 def score_tables(run: Run, formats: Formats) -> list[Table]:
     """Build the terminal tables of one run: the paper's metrics by scene, and the means of other families."""
-    families = by_family(in_tables(formats))
-    paper = [_score_table(run, families.pop(PAPER))] if PAPER in families else []
-    return [*paper, *([_family_table(run, families)] if families else [])]
+    wide = pd.DataFrame.from_dict(run.headlines, orient="index").dropna(axis=1, how="all")
+    families = {
+        family: {name: each for name, each in members.items() if name in wide}
+        for family, members in by_family(in_tables(formats)).items()
+    }
+    tables = [_score_table(run, wide, families.pop(PAPER))] if PAPER in families else []
+    return [*tables, _family_table(run, wide, families)] if families else tables
 
 
-def _family_table(run: Run, families: Mapping[str, Formats]) -> Table:
+def _score_table(run: Run, wide: pd.DataFrame, columns: Formats) -> Table:
+    """Build a terminal table: per scene our values, worst of four lights, and the paper's, then the mean."""
+    ours = wide[list(columns)] * [each.factor for each in columns.values()]
+    scenes = [str(scene) for scene in ours.index]
+    rows = [(scene, ours.loc[scene], paper_row(scene, [run], [scene])) for scene in scenes]
+    notes = [alignment_note([run])]
+    if any(paper is not None for _, _, paper in rows):
+        notes.append(implementation_note([paper_name(run)]))
+    if len(ours) > 1:
+        rows.append(("mean", ours.mean(), paper_row(average_of(run.dataset, scenes), [run], scenes)))
+    table = _terminal_table(f"{_about(run)} - {describe_directions(columns)}", "\n".join(filter(None, notes)))
+    table.add_column("scene", overflow="fold")
+    table.add_column("from")
+    for column in columns.values():
+        table.add_column(escape(f"{column.heading}\n{column.unit}"), justify="right", no_wrap=True)
+    for number, (name, values, paper) in enumerate(rows):
+        if number == len(scenes):
+            table.add_section()
+        lines = [(escape(name), "dsr", values, "bold" if number == len(scenes) else None)]
+        if paper is not None and paper.reindex(list(columns)).notna().any():
+            lines.append(("", "paper", paper, "dim"))
+        for heading, source, found, style in lines:
+            texts = [each.text(found[key]) if pd.notna(found.get(key)) else "-" for key, each in columns.items()]
+            table.add_row(heading, source, *texts, style=style)
+    return table
+
+
+def _family_table(run: Run, wide: pd.DataFrame, families: Mapping[str, Formats]) -> Table:
     """Build a terminal table with a row a metric: its mean, least and largest value of the scenes."""
-    table = Table(title=escape(_about(run)), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = _terminal_table(_about(run), alignment_note([run]))
     for name in ("family", "metric", "better"):
         table.add_column(name)
     for name in ("mean", "least", "most"):
         table.add_column(name, justify="right", no_wrap=True)
     for family, members in families.items():
-        ours = _in_shown_units(run, members)
-        for number, (name, values) in enumerate(ours.items()):
-            column = members[str(name)]
+        for number, (name, column) in enumerate(members.items()):
+            values = wide[name] * column.factor
             texts = [column.text(value) for value in (values.mean(), values.min(), values.max())]
             better = "higher" if column.higher_is_better else "lower"
             table.add_row("" if number else escape(family), escape(column.title), better, *texts)
-    table.caption, table.caption_justify = escape(alignment_note([run])) or None, "left"
     return table
-
-
-def _in_shown_units(run: Run, formats: Formats) -> pd.DataFrame:
-    """Return a run's scores as scene x metric, worst of four lights."""
-    wide = pd.DataFrame.from_dict(run.headlines, orient="index").dropna(axis=1, how="all")
-    columns = {name: each for name, each in in_tables(formats).items() if name in wide}
-    return wide[list(columns)] * [each.factor for each in columns.values()]
 
 
 def _about(run: Run) -> str:
@@ -233,35 +284,9 @@ def _about(run: Run) -> str:
     return f"{run.label} on {run.dataset}, x{run.scale}, {run.downsampling} downsampling"
 
 
-def _score_table(run: Run, formats: Formats) -> Table:
-    """Build a terminal table: per scene our values and the paper's, then the mean."""
-    ours = _in_shown_units(run, formats)
-    columns = {str(name): formats[str(name)] for name in ours}
-    title = f"{_about(run)} - {describe_directions(columns)}"
+def _terminal_table(title: str, caption: str) -> Table:
     table = Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    table.add_column("scene", overflow="fold")
-    table.add_column("from")
-    for column in columns.values():
-        table.add_column(escape(f"{column.heading}\n{column.unit}"), justify="right", no_wrap=True)
-    scenes = [str(scene) for scene in ours.index]
-    papers = [paper_row(scene, [run], [scene]) for scene in scenes]
-    rows = [(escape(scene), values) for scene, (_, values) in zip(scenes, ours.iterrows(), strict=True)]
-    beside = list(papers)
-    if len(ours) > 1:
-        rows.append(("mean", ours.mean()))
-        beside.append(paper_row(average_of(run.dataset, scenes), [run], scenes))
-    for number, ((name, values), paper) in enumerate(zip(rows, beside, strict=True)):
-        if number == len(scenes):
-            table.add_section()
-        table.add_row(name, "dsr", *_cells(values, columns), style="bold" if number == len(scenes) else None)
-        if paper is not None and paper.reindex(list(columns)).notna().any():
-            table.add_row("", "paper", *_cells(paper, columns), style="dim")
-    notes = [alignment_note([run])]
-    if any(paper is not None for paper in papers):
-        notes.append(implementation_note([paper_name(run)]))
-    if any(notes):
-        table.caption = escape("\n".join(filter(None, notes)))
-        table.caption_justify = "left"
+    table.caption, table.caption_justify = escape(caption) or None, "left"
     return table
 
 
@@ -270,7 +295,7 @@ def _values(key: str, column: MetricFormat, row: Row) -> Iterator[tuple[str, flo
     cell, paper = row.cells.get(key), row.published.get(key)
     unit = f" [{column.unit.split(', ')[-1]}]" if column.unit else ""  # the key names the threshold
     low, high = (None, None) if cell is None or cell.interval is None else cell.interval
-    difference, ratio = (None if cell is None else cell.against(paper)) or (None, None)
+    difference, ratio = row.against_paper(key)
     yield f"{key}{unit}", None if cell is None else cell.mean
     yield f"{key} spread{unit}", None if cell is None else cell.spread
     yield f"{key} seeds", None if cell is None or cell.spread is None else cell.seeds
@@ -292,29 +317,22 @@ def _compared(facts: Sequence[Fact], columns: Formats, group: Group) -> Iterator
     """Yield our value, the paper's, difference and ratio of each method in the paper, then its other methods."""
     rows = [row for row in group.rows if row.published]
     for number, row in enumerate(rows):
-        both = [_against(key, column, row) for key, column in columns.items()]
-        ours = []
+        ours, differences, ratios = [], [], []
         for key, column in columns.items():
             cell = row.cells.get(key)
             text = shown(column, cell.mean) if cell is not None and cell.scenes else MISSING
             ours.append(text if cell is None or cell.complete else f"{text} ({cell.scenes} of {cell.of})")
-        yield [*_MARKDOWN.facts(row, facts, first=number == 0), "ours", *ours]
+            difference, ratio = row.against_paper(key)
+            text = MISSING if difference is None else shown(column, difference)
+            differences.append(text if text.startswith(("-", MISSING)) else f"+{text}")
+            ratios.append(MISSING if ratio is None else f"{ratio:.2f}")
         blank = [""] * len(facts)
+        yield [*_MARKDOWN.facts(row, facts, first=number == 0), "ours", *ours]
         yield [*blank, "paper", *_MARKDOWN.paper(columns, row.published)]
-        yield [*blank, "difference", *(difference for difference, _ in both)]
-        yield [*blank, "ratio", *(ratio for _, ratio in both)]
+        yield [*blank, "difference", *differences]
+        yield [*blank, "ratio", *ratios]
     for number, row in enumerate(group.paper_only, len(rows)):
         yield [*_MARKDOWN.facts(row, facts, first=number == 0), "paper", *_MARKDOWN.paper(columns, row.published)]
-
-
-def _against(key: str, column: MetricFormat, row: Row) -> tuple[str, str]:
-    """Format the difference from the paper's value and the ratio to it."""
-    cell, paper = row.cells.get(key), row.published.get(key)
-    difference, ratio = (None if cell is None else cell.against(paper)) or (None, None)
-    if difference is None:
-        return MISSING, MISSING
-    text = shown(column, difference)
-    return text if text.startswith("-") else f"+{text}", MISSING if ratio is None else f"{ratio:.2f}"
 
 
 def _pages(groups: Sequence[list[str]]) -> Iterator[list[list[str]]]:
@@ -331,46 +349,8 @@ def _pages(groups: Sequence[list[str]]) -> Iterator[list[list[str]]]:
         yield page
 
 
-def _columns(table: PaperTable, *, published: bool) -> tuple[list[Fact], Formats]:
-    """Return the columns of a LaTeX table."""
-    if published:
-        return [fact for fact in table.facts if not fact.number], table.published_columns()
-    return table.facts, table.columns
-
-
-def _page(table: PaperTable, groups: Sequence[Sequence[str]], number: int, published: bool) -> str:
-    """Return one table environment."""
-    facts, columns = _columns(table, published=published)
-    title = table.title + (", beside the paper's values (in parentheses)" if published else "")
-    caption = f"{title}. {' '.join(table.notes)}" if number == 0 else f"{title}, continued."
-    kinds = "".join("r" if fact.number else "l" for fact in facts) + "r" * len(columns)
-    head = [fact.name.capitalize() for fact in facts]
-    for column in columns.values():
-        name, _, index = column.heading.partition("_")
-        head.append(latex_text(name) + (f"$_{{{latex_text(index)}}}$" if index else ""))
-    units = [*("" for _ in facts), *(latex_text(column.unit) for column in columns.values())]
-    body = "\n\\midrule\n".join("\n".join(rows) for rows in groups)
-    return rf"""\begin{{table}}[htbp]
-\centering
-\caption{{{latex_text(caption)}}}
-\smallskip
-\resizebox{{\ifdim\width>\linewidth \linewidth\else\width\fi}}{{!}}{{%
-\begin{{tabular}}{{@{{}}{kinds}@{{}}}}
-\toprule
-{" & ".join(head)} \\
-{" & ".join(units)} \\
-\midrule
-{body}
-\bottomrule
-\end{{tabular}}%
-}}
-\end{{table}}
-"""
-
-
-def _latex_rows(table: PaperTable, group: Group, *, published: bool) -> Iterator[str]:
+def _latex_rows(group: Group, facts: Sequence[Fact], columns: Formats, *, published: bool) -> Iterator[str]:
     """Yield the lines of a group; the title is in the first line, that of an average in a line of its own."""
-    facts, columns = _columns(table, published=published)
     compared = any(row.published for row in group.rows)  # all of our rows are needed, since the best is marked
     rows = [row for row in group.rows if not published or (compared and row.cells)]
     line, average = _beside if published else _LATEX.row, group.about.average
@@ -392,11 +372,6 @@ def _beside(row: Row, facts: Sequence[Fact], columns: Formats, *, first: bool) -
     ours = _LATEX.row(replace(row, cells=cells, seeds=1), facts, columns, first=first)
     paper = _LATEX.paper(columns, row.published)
     return [*ours[: len(facts)], *(f"{own} ({its})" for own, its in zip(ours[len(facts) :], paper, strict=True))]
-
-
-def _cells(values: pd.Series, columns: Formats) -> list[str]:
-    """Format the values of a row with the digits of each column; "-" for missing values."""
-    return [each.text(values[name]) if pd.notna(values.get(name)) else "-" for name, each in columns.items()]
 
 
 _MARKDOWN = Style(

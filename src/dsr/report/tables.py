@@ -45,7 +45,7 @@ from dsr.report.paper import (
     sets_of_summary,
 )  # fmt: skip
 from dsr.report.significance import LEAST, LEVEL, interval_of_mean, p_of_difference
-from dsr.report.study.study_table import PERCENTAGES, check_study, study_cells
+from dsr.report.study.percentages import PERCENTAGES, check_study, study_cells
 
 
 @dataclass(frozen=True)
@@ -61,12 +61,6 @@ class Cell:
     by_scene: tuple[float, ...] = field(default=(), repr=False)  # value of each averaged scene
     significant: bool = False  # whether it is the best, and better than the second best by a paired test
     rank: int = 0  # 1 for the best displayed value, 2 for the second best; 0 for others
-
-    def against(self, paper: float | None) -> tuple[float, float | None] | None:
-        """Return the difference from the paper's value and the ratio to it; None if they are not comparable."""
-        if paper is None or not self.complete:
-            return None
-        return self.mean - paper, self.mean / paper if paper else None
 
     @property
     def complete(self) -> bool:
@@ -85,6 +79,13 @@ class Row:
     seeds: int = 1  # maximum number of seeds of a cell; 0 for the paper's values alone
     cells: Mapping[str, Cell] = field(default_factory=dict)  # by column; missing values have none
     published: Mapping[str, float] = field(default_factory=dict)  # the paper's values by column
+
+    def against_paper(self, key: str) -> tuple[float | None, float | None]:
+        """Return the difference from the paper's value and the ratio to it; None if they are not comparable."""
+        cell, paper = self.cells.get(key), self.published.get(key)
+        if cell is None or paper is None or not cell.complete:
+            return None, None
+        return cell.mean - paper, cell.mean / paper if paper else None
 
 
 @dataclass(frozen=True)
@@ -121,8 +122,9 @@ class PaperTable:
         """The columns before those of values, in layouts for readers."""
         return [fact for fact in FACTS if fact.shown(self.rows)]
 
+    @property
     def published_columns(self) -> Formats:
-        """Return the columns with values of the paper."""
+        """The columns with values of the paper."""
         return {key: each for key, each in self.columns.items() if any(key in row.published for row in self.rows)}
 
 
@@ -194,12 +196,12 @@ def build_tables(results: Results, study: pd.DataFrame | None = None, *, interva
                 heading = f"{heading}, x{scale}, {downsampling} downsampling"
                 table = _table(heading, runs, groups, formats)
                 if paper or table.columns:
-                    tables.append(replace(table, name=_unique(f"{stem}_x{scale}_{downsampling}", names)))
+                    tables.append(replace(table, name=unique_name(f"{stem}_x{scale}_{downsampling}", names)))
     return tables
 
 
-def _unique(stem: str, taken: set[str]) -> str:
-    """Return a name that is unique on any file system."""
+def unique_name(stem: str, taken: set[str]) -> str:
+    """Return a file name that no other one of them equals on any file system, and add it to them."""
     slug = re.sub(r"[^A-Za-z0-9.-]+", "_", stem).strip("._-")
     name, number = slug, 2
     while name.casefold() in taken:

@@ -11,17 +11,9 @@ from dsr.evaluation.results import Results
 from dsr.utils.processes import Pool
 from dsr.utils.progress import SILENT
 
-_FEW = 24  # predictions below which the start of worker processes takes longer than they save
-_MOST = 8  # workers unless more are requested; each needs about 0.5 GB
 _results: Results | None = None  # that this process works on, if it is a worker
 _Item = TypeVar("_Item")
 _Value = TypeVar("_Value")
-
-
-def default_workers(results: Results) -> int:
-    """Return the number of worker processes that a report of some results is worth: one per core, or 1 for none."""
-    predictions = sum(len(run.scenes) for run in results.runs)
-    return 1 if predictions < _FEW else min(os.cpu_count() or 1, _MOST)
 
 
 class WorkerPool(contextlib.ExitStack):

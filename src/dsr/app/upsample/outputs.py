@@ -286,13 +286,13 @@ def _write_maps(folder: Path, result: Result) -> dict[str, Output]:
     if "normals" in names:
         write_normals(folder / "normals.png", surface.depth, camera)
     if "before_after" in names:
-        from dsr.pictures.before_after import write_before_after  # noqa: PLC0415 - Matplotlib, which takes a second
+        from dsr.pictures.panels import write_before_after  # noqa: PLC0415 - Matplotlib, which takes a second
 
         title = ", ".join(filter(None, (result.name, f"{result.plan.method} x{result.plan.scale}")))
         path = folder / "before_after.png"
         write_before_after(path, picture.rgb, picture.depth_lr, surface.depth, camera, title)
     if "confidence" in names and surface.depth_error is not None and surface.angle_error is not None:
-        from dsr.pictures.expected_errors import write_confidence  # noqa: PLC0415 - as above
+        from dsr.pictures.panels import write_confidence  # noqa: PLC0415 - as above
 
         write_confidence(folder / "confidence.png", surface.depth, surface.depth_error, surface.angle_error)
         with replacing(folder / ERRORS) as temporary, temporary.open("wb") as file:

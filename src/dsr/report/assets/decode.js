@@ -1,4 +1,4 @@
-// From the page's data to maps: see dsr/report/surface_packing.py, which writes them.
+// From the page's data to maps: see dsr/report/surface_page.py, which writes them.
 
 /** Undo the compression by zlib. */
 async function inflate(bytes) {

@@ -6,7 +6,7 @@ import base64
 import hashlib
 import io
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from dsr.pictures.depth_views import rendering
 from dsr.report.html_page import asset, fill, json_text, policy
 from dsr.report.shown_scenes import View, results_of, stored_sample, views_of
 from dsr.report.study import Choice
-from dsr.report.study.key import KEY_NAME, PAGE_VERSION, Candidate, Key, Trial, read_key, write_key
+from dsr.report.study.files import KEY_NAME, PAGE_VERSION, Candidate, Key, Trial, read_key, write_key
 from dsr.utils.files import expect_targets, write_text
 from dsr.utils.progress import SILENT, Progress
 from dsr.utils.ratios import as_ratio
@@ -29,17 +29,6 @@ _DIGITS = 12
 """Digits of a hash that make an id."""
 _FEWEST = 2
 """Minimum number of methods in a question."""
-
-
-@dataclass(frozen=True)
-class _Question:
-    """A scene with its pictures as PNG: that of the ground truth, and one of each result."""
-
-    view: View
-    runs: tuple[Run, ...]
-    truth: bytes
-    pictures: tuple[bytes, ...]
-    size: tuple[int, int]  # width and height
 
 
 @dataclass(frozen=True)
@@ -59,40 +48,22 @@ def build_study(
     *,
     overwrite: bool = False,
 ) -> Built:
-    """Write the page ``index.html`` and the key ``key.json`` of a study.
+    """Write the page ``index.html`` and the key ``key.json`` of a study into a directory.
 
-    Args:
-        results: runs to compare.
-        folder: output directory, created if missing.
-        choice: selection of the questions.
-        progress: shows the scenes that are drawn.
-        overwrite: whether to replace another study in the directory; its answers can then no longer be collected.
-
-    Raises:
-        ValueError: nothing is left to compare, the choice names a value that no run has, a file is damaged, the title
-            contains the name of a method, or the directory holds another study.
-        TargetError: a link, a device, a pipe or a socket is in the place of the key or the page.
-
+    Another study in it, whose answers can then no longer be collected, is replaced only if ``overwrite``.
     """
     choice = choice or Choice()
     expect_targets(folder, (KEY_NAME, PAGE_NAME))
-    _expect_existing(results, choice)
-    selected = Results(tuple(run for run in results.runs if _is_selected(run, choice)))
-    _expect_blind(choice, selected.methods())
-    views = [view for problem in selected.problems() for view in views_of(selected, problem)]
-    views = [view for view in views if not choice.scenes or view.scene in choice.scenes]
+    selected = _select(results, choice)
+    for name, text in (("title", choice.title), ("send-to", choice.send_to)):
+        for label in selected.methods():
+            if label and label.casefold() in text.casefold():
+                raise ValueError(f"{name}: expected words without the methods' names, got {label!r} in {text!r}")
     notes = list(results.notes)
-    questions = []
-    for view in progress.track(views, "draw", label=lambda view: view.scene):
-        question = _draw(view, choice.light, notes)
-        if question is not None:
-            questions.append(question)
-            missing = sorted({run.label for run in selected.of(view.problem)} - {run.label for run in view.runs})
-            notes += [f"{view}: without {', '.join(missing)}, which has no prediction of it"] if missing else []
-    if not questions:
+    scenes, trials = _questions(selected, choice, progress, notes)
+    if not scenes:
         detail = f"; {notes[-1]}" if notes else ""
         raise ValueError(f"study: expected a scene with its ground truth and {_FEWEST} methods, found none{detail}")
-    scenes, trials = _with_ids(questions)
     per_person = _within("scenes per person", choice.scenes_per_person, 1, len(scenes), len(scenes))
     repeat = _within("repeat", choice.repeat, 0, per_person, 0)
     asked: dict[str, Any] = {"perPerson": per_person, "repeat": repeat, "scenes": scenes}
@@ -116,17 +87,8 @@ def build_study(
     return Built(folder / PAGE_NAME, key, tuple(notes))
 
 
-def _is_selected(run: Run, choice: Choice) -> bool:
-    """Return whether a run is selected."""
-    return (
-        (not choice.scales or run.scale in choice.scales)
-        and (not choice.downsamplings or run.downsampling in choice.downsamplings)
-        and (not choice.methods or run.label in choice.methods or run.method in choice.methods)
-    )
-
-
-def _expect_existing(results: Results, choice: Choice) -> None:
-    """Check that each value in the choice occurs in a run."""
+def _select(results: Results, choice: Choice) -> Results:
+    """Return the runs that are chosen; each value in the choice has to occur in a run."""
     available: dict[str, tuple[Sequence[Any], set[Any]]] = {
         "scale": (tuple(map(as_ratio, choice.scales)), {run.scale for run in results.runs}),
         "downsampling": (choice.downsamplings, {run.downsampling for run in results.runs}),
@@ -137,18 +99,48 @@ def _expect_existing(results: Results, choice: Choice) -> None:
         for name in asked:
             if name not in existing:
                 raise ValueError(f"{what}: expected one of {', '.join(map(str, sorted(existing)))}, got {name!r}")
+    runs = (run for run in results.runs if not choice.scales or run.scale in choice.scales)
+    runs = (run for run in runs if not choice.downsamplings or run.downsampling in choice.downsamplings)
+    runs = (run for run in runs if not choice.methods or not {run.label, run.method}.isdisjoint(choice.methods))
+    return Results(tuple(runs))
 
 
-def _expect_blind(choice: Choice, labels: Iterable[str]) -> None:
-    """Check that the texts of the page do not contain the name of a method."""
-    for name, text in (("title", choice.title), ("send-to", choice.send_to)):
-        for label in labels:
-            if label and label.casefold() in text.casefold():
-                raise ValueError(f"{name}: expected words without the methods' names, got {label!r} in {text!r}")
+def _questions(
+    results: Results, choice: Choice, progress: Progress, notes: list[str]
+) -> tuple[list[dict[str, Any]], dict[str, Trial]]:
+    """Return the scenes of the page, ordered by id, and the trials of the key; ``notes`` takes what is left out.
+
+    Ids are hashes of pictures, so neither the ids nor the order on the page reveal a name.
+    """
+    views = [view for problem in results.problems() for view in views_of(results, problem)]
+    views = [view for view in views if not choice.scenes or view.scene in choice.scenes]
+    scenes: list[dict[str, Any]] = []
+    trials: dict[str, Trial] = {}
+    for view in progress.track(views, "draw", label=lambda view: view.scene):
+        drawn = _draw(view, choice.light, notes)
+        if drawn is None:
+            continue
+        missing = sorted({run.label for run in results.of(view.problem)} - {run.label for run in view.runs})
+        notes += [f"{view}: without {', '.join(missing)}, which has no prediction of it"] if missing else []
+        truth, size, pictures = drawn
+        scene_id = _hash(str(len(scenes)).encode(), truth, *sorted(picture for _, picture in pictures))
+        images, candidates = {}, {}
+        for number, (run, picture) in enumerate(pictures):
+            name = _hash(scene_id.encode(), picture, str(number).encode())
+            images[name] = base64.b64encode(picture).decode()
+            candidates[name] = Candidate(run.label, run.method, str(run.folder))
+        shown = {"truth": base64.b64encode(truth).decode(), "images": dict(sorted(images.items()))}
+        scenes.append({"id": scene_id, "width": size[0], "height": size[1], **shown})
+        dataset, scale, downsampling = view.problem
+        trials[scene_id] = Trial(dataset, view.scene, scale, downsampling, candidates)
+    return sorted(scenes, key=lambda scene: str(scene["id"])), trials
 
 
-def _draw(view: View, light: str, notes: list[str]) -> _Question | None:
-    """Draw the pictures of a question; None for a scene that cannot be one, for which ``notes`` takes the reason."""
+def _draw(view: View, light: str, notes: list[str]) -> tuple[bytes, tuple[int, int], list[tuple[Run, bytes]]] | None:
+    """Draw the ground truth, of a width and height, and each run's result as PNG.
+
+    It is None for a scene that cannot be a question; ``notes`` takes the reason.
+    """
     if len(view.runs) < _FEWEST:
         notes.append(f"left out: {view}: only {view.runs[0].label} has a prediction of it")
         return None
@@ -173,9 +165,8 @@ def _draw(view: View, light: str, notes: list[str]) -> _Question | None:
         label = result.run.label
         if labels.setdefault(picture, label) != label:
             notes.append(f"{view}: {labels[picture]} and {label} look exactly the same")
-        pictures.append(picture)
-    runs = tuple(result.run for result in results)
-    return _Question(view, runs, grey_png(truth, valid), tuple(pictures), (valid.shape[1], valid.shape[0]))
+        pictures.append((result.run, picture))
+    return grey_png(truth, valid), (valid.shape[1], valid.shape[0]), pictures
 
 
 def grey_png(shades: np.ndarray, valid: np.ndarray) -> bytes:
@@ -186,44 +177,12 @@ def grey_png(shades: np.ndarray, valid: np.ndarray) -> bytes:
     return content.getvalue()
 
 
-def _with_ids(questions: Sequence[_Question]) -> tuple[list[dict[str, Any]], dict[str, Trial]]:
-    """Return the scenes of the page, ordered by id, and the trials of the key.
-
-    Ids are hashes of pictures, so neither the ids nor the order on the page reveal a name.
-    """
-    scenes, trials = [], {}
-    for number, each in enumerate(questions):
-        scene_id = _hash(str(number).encode(), each.truth, *sorted(each.pictures))
-        ids = [_hash(scene_id.encode(), picture, str(i).encode()) for i, picture in enumerate(each.pictures)]
-        images = {name: _text(picture) for name, picture in zip(ids, each.pictures, strict=True)}
-        width, height = each.size
-        scenes.append(
-            {
-                "id": scene_id,
-                "width": width,
-                "height": height,
-                "truth": _text(each.truth),
-                "images": dict(sorted(images.items())),
-            }
-        )
-        named = {
-            name: Candidate(run.label, run.method, str(run.folder)) for name, run in zip(ids, each.runs, strict=True)
-        }
-        dataset, scale, downsampling = each.view.problem
-        trials[scene_id] = Trial(dataset, each.view.scene, scale, downsampling, named)
-    return sorted(scenes, key=lambda scene: str(scene["id"])), trials
-
-
 def _hash(*parts: bytes) -> str:
     """Return the id of some bytes."""
     digest = hashlib.sha256()
     for part in parts:
         digest.update(len(part).to_bytes(8, "big") + part)
     return digest.hexdigest()[:_DIGITS]
-
-
-def _text(png: bytes) -> str:
-    return base64.b64encode(png).decode()
 
 
 def _within(what: str, value: int | None, low: int, high: int, default: int) -> int:

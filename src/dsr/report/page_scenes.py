@@ -32,7 +32,7 @@ from dsr.geometry.lights import BASIS
 from dsr.geometry.surface import normal_mask, shade
 from dsr.metrics.calibration import error_ratios, measured_errors, squared_error_share
 from dsr.pictures.depth_views import limits_of, normals_seen_by, reduced
-from dsr.report.shown_scenes import Result, View, results_of, stored_sample, views_of
+from dsr.report.shown_scenes import View, results_of, stored_sample, views_of
 from dsr.sample import DepthSample
 
 _LEAST_ERROR = 1e-4
@@ -49,14 +49,9 @@ _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PN
 
 @dataclass
 class PictureStore:
-    """Pictures by name, each stored once, as lossless PNG in base64.
+    """Pictures by name, each stored once, as lossless PNG in base64."""
 
-    Args:
-        longest: maximum longer side, pixels; larger pictures are reduced.
-
-    """
-
-    longest: int
+    longest: int  # maximum longer side, pixels; larger pictures are reduced
     pictures: dict[str, str] = field(default_factory=dict)
     reduced: bool = False
 
@@ -75,39 +70,21 @@ class PictureStore:
         return torch.where(valid, fitted, 0).permute(1, 2, 0).numpy(), valid.numpy()
 
 
-def shading_picture(shadings: np.ndarray) -> np.ndarray:
-    """Encode (H, W, 3) shadings in [-1, 1] as an (H, 3 W, 1) picture: the three side by side."""
-    levels = np.rint((np.clip(shadings, -1, 1) + 1) * 127.5).astype(np.uint8)
-    return np.concatenate(np.split(levels, 3, axis=-1), axis=1)
+Encoded = tuple[dict[str, Any] | None, PictureStore, list[str]]
+"""Data of a scene (None for a scene without pictures), its pictures, and notes."""
 
 
-def depth_picture(depth: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Encode depth in metres as a picture: 0 at ``low`` and below, 255 at ``high`` and above."""
-    return np.rint(255 * np.clip((depth - low) / (high - low), 0, 1)).astype(np.uint8)
-
-
-def error_picture(error: np.ndarray, largest: float) -> np.ndarray:
-    """Encode signed errors as a picture: 128 is zero, 1 and 255 are -``largest`` and ``largest`` or beyond."""
-    relative = np.clip(error / largest, -1, 1)
-    return (128 + np.rint(127 * np.sign(relative) * np.sqrt(np.abs(relative)))).astype(np.uint8)
-
-
-def expected_picture(error: np.ndarray, largest: float) -> np.ndarray:
-    """Encode expected errors, 0 or more, as a picture: 255 is ``largest`` or beyond."""
-    return np.rint(255 * np.sqrt(np.clip(error / largest, 0, 1))).astype(np.uint8)
-
-
-def mask_picture(depth_valid: np.ndarray, normal_valid: np.ndarray) -> np.ndarray:
-    """Encode (H, W) valid masks as an (H, W, 1) picture."""
-    picture = np.where(normal_valid & depth_valid, ALL_VALID, DEPTH_VALID)
-    return np.where(depth_valid, picture, NOTHING_VALID).astype(np.uint8)[..., None]
-
-
-def scene_data(view: View, pool: PictureStore, notes: list[str]) -> dict[str, Any] | None:
-    """Return the data of a scene for the page, None without a stored scene; its pictures are added to the pool."""
+def encode_scene(longest: int, results: Results, place: tuple[BenchmarkSetting, str]) -> Encoded:
+    """Return the data of a scene of a setting for the page, with pictures of at most ``longest`` pixels."""
+    problem, scene = place
+    view = next(view for view in views_of(results, problem) if view.scene == scene)
+    pool, notes = PictureStore(longest), list[str]()
     stored = stored_sample(view, notes)
-    if stored is None:
-        return None
+    return None if stored is None else _scene_data(view, stored, pool, notes), pool, notes
+
+
+def _scene_data(view: View, stored: DepthSample, pool: PictureStore, notes: list[str]) -> dict[str, Any]:
+    """Return the data of a scene; its pictures are added to the pool."""
     predictions = results_of(view, stored, notes)
     reference = stored.depth if stored.depth is not None else (predictions[0].depth if predictions else stored.depth_lr)
     low, high = limits_of(reference)
@@ -154,11 +131,13 @@ def _surface(depth: Tensor, camera: Camera, data: dict[str, Any], pool: PictureS
     if min(depth.shape[-2:]) > 1:
         shadings = shade(normals_seen_by(camera, depth), basis)[0]
     fitted, normal_valid = pool.fit(shadings)
+    levels = np.rint((np.clip(fitted, -1, 1) + 1) * 127.5).astype(np.uint8)
     metres, depth_valid = pool.fit(depth)
+    low, high = data["depth"]
     surface = {
         "size": [fitted.shape[1], fitted.shape[0]],
-        "normals": pool.add(shading_picture(fitted)),
-        "depth": pool.add(depth_picture(metres, *data["depth"])),
+        "normals": pool.add(np.concatenate(np.split(levels, 3, axis=-1), axis=1)),
+        "depth": pool.add(np.rint(255 * np.clip((metres - low) / (high - low), 0, 1)).astype(np.uint8)),
     }
     return surface | _mask(depth_valid, normal_valid, pool)
 
@@ -167,13 +146,16 @@ def _mask(depth_valid: np.ndarray, normal_valid: np.ndarray, pool: PictureStore)
     """Store the mask of a picture, if some of its pixels are invalid."""
     if depth_valid.all() and normal_valid.all():
         return {}
-    return {"mask": pool.add(mask_picture(depth_valid, normal_valid))}
+    levels = np.where(normal_valid & depth_valid, ALL_VALID, DEPTH_VALID)
+    return {"mask": pool.add(np.where(depth_valid, levels, NOTHING_VALID).astype(np.uint8)[..., None])}
 
 
 def _error(difference: Tensor, largest: float, pool: PictureStore) -> dict[str, str]:
     """Store a signed error, (1, H, W) in metres."""
     values, valid = pool.fit(difference)
-    return {"values": pool.add(error_picture(values, largest))} | _mask(valid, valid, pool)
+    relative = np.clip(values / largest, -1, 1)
+    levels = 128 + np.rint(127 * np.sign(relative) * np.sqrt(np.abs(relative)))
+    return {"values": pool.add(levels.astype(np.uint8))} | _mask(valid, valid, pool)
 
 
 def _expected(
@@ -182,13 +164,11 @@ def _expected(
     """Store the expected errors, (1, H, W) in metres and degrees, where the depth and its normals are known."""
     known = depth.isfinite()
     normals_known = normal_mask(known) if min(known.shape[-2:]) > 1 else torch.zeros_like(known)
-    depth_error, depth_valid = pool.fit(torch.where(known, errors[0], torch.nan))
-    angle_error, angle_valid = pool.fit(torch.where(normals_known, errors[1], torch.nan))
-    stored = {
-        "depth": pool.add(expected_picture(depth_error, largest["depth"])),
-        "angle": pool.add(expected_picture(angle_error, largest["angle"])),
-    }
-    return stored | _mask(depth_valid, angle_valid, pool)
+    stored, valid = {}, {}
+    for name, error, there in (("depth", errors[0], known), ("angle", errors[1], normals_known)):
+        values, valid[name] = pool.fit(torch.where(there, error, torch.nan))
+        stored[name] = pool.add(np.rint(255 * np.sqrt(np.clip(values / largest[name], 0, 1))).astype(np.uint8))
+    return stored | _mask(valid["depth"], valid["angle"], pool)
 
 
 def _error_limits(differences: Sequence[Tensor]) -> tuple[float, dict[str, float]]:
@@ -231,7 +211,10 @@ def calibration_data(results: Results, problem: BenchmarkSetting) -> list[dict[s
         step = step or math.ceil(stored.depth.numel() * len(views) / _MOST_PIXELS)
         for result in results_of(confident, stored, []):
             if result.errors is not None:
-                errors = _errors(result, result.errors, stored, stored.depth, step)
+                truth = stored.depth.double()[None]
+                depth, angle = measured_errors(result.depth[None], truth, stored.camera.rays()[None])
+                maps = (result.errors[0], depth, result.errors[1], angle)
+                errors = torch.stack([each.flatten()[::step].float() for each in maps])
                 found.setdefault(result.run.label, {})[view.scene] = errors
     shared = [scene for scene in next(iter(found.values()), ()) if all(scene in of for of in found.values())]
     return [
@@ -247,13 +230,6 @@ def _is_confident(run: Run, scene: str) -> bool:
         return run.expected_errors(scene) is not None
     except ValueError:
         return False
-
-
-def _errors(result: Result, expected: tuple[Tensor, Tensor], stored: DepthSample, truth: Tensor, step: int) -> Tensor:
-    """Return expected and measured errors of depth, then of normals, at every ``step``-th pixel: (4, N) float32."""
-    depth, angle = measured_errors(result.depth[None], truth.double()[None], stored.camera.rays()[None])
-    maps = (expected[0], depth, expected[1], angle)
-    return torch.stack([each.flatten()[::step].float() for each in maps])
 
 
 def _agreement(errors: Tensor) -> dict[str, dict[str, Any]]:
