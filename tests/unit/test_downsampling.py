@@ -144,15 +144,6 @@ def _points(depth, camera):
     return depth * camera.rays()
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_sphere_around_the_camera_is_reproduced_in_perspective_depth(kernel):
-    sphere = (2.0 / CAMERA.ray_lengths())[None]
-    for scale in SCALES:
-        sample = make_sample(_scene(sphere), scale, Downsampling(kernel), "perspective")
-        radii = _points(sample.depth_lr, sample.camera_lr).norm(dim=0)
-        torch.testing.assert_close(radii, torch.full_like(radii, 2.0), rtol=1e-12, atol=0)
-
-
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_low_resolution_camera_has_the_points_of_a_tilted_plane(kernel, camera):

@@ -70,12 +70,6 @@ def test_bilinear_weights_the_four_neighbours_by_distance():
     np.testing.assert_allclose(_result(_sample(perspective), "bilinear"), (1 - a) * upper + a * lower, rtol=1e-12)
 
 
-@pytest.mark.parametrize("order", ORDERS)
-@pytest.mark.parametrize("kernel", ["box", "nearest", "bicubic"])
-def test_sphere_around_the_camera_is_reproduced(order, kernel):
-    np.testing.assert_allclose(_result(_sample(torch.full((32, 48), 2.0).double(), kernel), order), 2.0, rtol=1e-12)
-
-
 @pytest.mark.parametrize("kernel", ["box", "nearest"])
 def test_low_and_high_resolution_pixels_are_matched_through_their_cameras(kernel):
     perspective = _ramp()
@@ -131,13 +125,6 @@ def test_down_and_up_is_pillows_bicubic(range_type, scale):
     small = _pillow(true, 40 // scale, 48 // scale)
     found = to_range(CubicConvolution(range_type)(sample), SMALL, range_type)[0].numpy()
     np.testing.assert_allclose(found, _pillow(torch.from_numpy(small)[None], 40, 48), rtol=2e-5)
-
-
-def test_perspective_depth_is_interpolated_along_the_rays():
-    sample = _cubic_convolution_sample("perspective", 4)
-    small = to_range(sample.depth_lr, sample.camera_lr, "perspective")
-    found = to_range(CubicConvolution("perspective")(sample), SMALL, "perspective")[0].numpy()
-    np.testing.assert_allclose(found, _pillow(small, 40, 48), rtol=2e-5)
 
 
 def test_pixels_are_matched_through_the_cameras():

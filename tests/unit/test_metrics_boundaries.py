@@ -1,6 +1,5 @@
 """Boundary F1, boundary errors and planes: the values of their authors' code, closed forms, holes."""
 
-import itertools
 import math
 
 import numpy as np
@@ -10,7 +9,7 @@ from depth_steps import CAMERA, UNKNOWN, holed, pair_of, steps
 
 from dsr.geometry.camera import Camera
 from dsr.metrics import boundaries
-from dsr.metrics.catalogue import catalogue, score_image
+from dsr.metrics.catalogue import catalogue
 
 METRICS = tuple(each for each in catalogue(protocols=("boundaries",)) if each.region is None)
 THRESHOLDS = np.linspace(1.05, 1.25, 10)
@@ -162,13 +161,3 @@ def test_holes_of_a_prediction_miss_the_edges_there_and_are_reported():
     assert part["DBE_completeness"] > full["DBE_completeness"] == 0
     assert part["DepthPro_ceiling"] == full["DepthPro_ceiling"]
     assert part["Boundary_covered"] == pytest.approx(1 - 30 * 60 / truth.size)
-
-
-@pytest.mark.parametrize("size", list(itertools.product((1, 2, 3, 6, 7), (1, 8))))
-def test_small_maps_have_the_scores_that_they_are_large_enough_for(size):
-    maps = (torch.full((1, *size), depth) for depth in (2.0, 2.1))
-    rows = {row.metric: row.value for row in score_image(*maps, CAMERA.rays()[:, : size[0], : size[1]], METRICS)}
-    for metric in METRICS:
-        if min(size) < metric.min_size:
-            assert math.isnan(rows[metric.name])
-    assert rows["DDE_right"] == rows["Boundary_covered"] == 1

@@ -96,14 +96,6 @@ def test_images_that_cannot_be_scored_are_left_out():
         assert metric.compute().item() == pytest.approx(alone.compute().item(), rel=1e-12)
 
 
-def test_masked_pixels_do_not_count():
-    pair = _pair(0)
-    mask = torch.rand(pair.target.shape, generator=torch.Generator().manual_seed(0)) < 0.5
-    expected = functional.rmse_d(SurfacePair(*pair.given, pair.rays, mask))
-    torch.testing.assert_close(RMSEd()(*_maps(pair), mask), expected[0], rtol=1e-12, atol=0)
-    assert not torch.allclose(expected, functional.rmse_d(pair), rtol=1e-3)
-
-
 def test_states_of_two_processes_add_up_and_one_that_a_metric_is_for_suffices():
     here, there = (visual_metrics(protocols=("paper", "field")) for _ in range(2))
     levels = SurfacePair(*_pair(1).given, _pair(1).rays, unit=Unit("levels", inverse=True, factor=8.0))
@@ -165,12 +157,6 @@ def test_mean_is_nan_where_a_prediction_leaves_nothing_to_score():
     target = torch.full((1, 1, 36, 40), 2.0, dtype=torch.float64)
     metric.update(SurfacePair(-target, target, CAMERA.rays()[None]))
     assert math.isnan(metric.compute())
-
-
-def test_rays_of_one_camera_serve_a_batch():
-    depth = 2 + torch.rand(2, 1, 36, 40)
-    pair, rays = (SurfacePair.of(depth, depth * 1.01, each) for each in (CAMERA, CAMERA.rays()))
-    assert torch.equal(functional.rmse_d(rays), functional.rmse_d(pair))
 
 
 @pytest.mark.parametrize(

@@ -9,18 +9,8 @@ from reference_metrics import Intrinsics, Reference
 from scipy import ndimage
 
 from dsr.geometry.camera import Camera
-from dsr.metrics.functional import (
-    SurfacePair,
-    bad_pix_d,
-    bad_pix_v,
-    bumpiness_d,
-    dssim_v,
-    masked_median,
-    mse_v,
-    rmse_d,
-    rmse_v,
-    rmse_v1,
-)
+from dsr.metrics.catalogue import catalogue
+from dsr.metrics.functional import SurfacePair, dssim_v, masked_median, mse_v, rmse_d, rmse_v
 
 
 class Maps(NamedTuple):
@@ -38,6 +28,7 @@ def _maps(size=(32, 48), seed=0, *, holes=False):
     smooth = [ndimage.gaussian_filter(random.normal(size=size), 3, mode="nearest") for _ in range(2)]
     target = 2 + 0.5 * smooth[0] + 0.4 * (np.arange(width) > 0.6 * width)
     prediction = target + 0.4 * smooth[1] + 0.0005 * random.normal(size=size)
+    prediction[20:23, 2:5] += 0.4  # more than 10 % of the depth
     if holes:
         target[random.random(size) < 0.01] = np.nan
         target[5:13, 7:15] = np.nan
@@ -54,39 +45,21 @@ def _pair(maps, mask=None, dtype=torch.float64):
 
 
 def _reference(maps, mask=None):
-    camera = maps.camera
-    return Reference(maps.prediction, maps.target, Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy), mask)
+    intrinsics = Intrinsics(maps.camera.fx, maps.camera.fy, maps.camera.cx, maps.camera.cy)
+    return Reference(maps.prediction, maps.target, intrinsics, mask).all_metrics()
 
 
-METRICS = {
-    "RMSE_d": (rmse_d, Reference.rmse_d),
-    "BadPix_d_1cm": (lambda pair: bad_pix_d(pair, 0.01), lambda reference: reference.bad_pix_d(0.01, relative=False)),
-    "BadPix_d_5cm": (lambda pair: bad_pix_d(pair, 0.05), lambda reference: reference.bad_pix_d(0.05, relative=False)),
-    "BadPix_d_1pct": (
-        lambda pair: bad_pix_d(pair, 0.01, relative=True),
-        lambda reference: reference.bad_pix_d(0.01, relative=True),
-    ),
-    "MSE_v": (mse_v, lambda reference: reference.rmse_v() ** 2),
-    "RMSE_v": (rmse_v, Reference.rmse_v),
-    "RMSE_v1": (rmse_v1, Reference.rmse_v1),
-    "BadPix_v_1": (lambda pair: bad_pix_v(pair, 1), lambda reference: reference.bad_pix_v(1)),
-    "BadPix_v_10": (lambda pair: bad_pix_v(pair, 10), lambda reference: reference.bad_pix_v(10)),
-    "DSSIM_v": (dssim_v, Reference.dssim_v),
-    "Bumpiness_d": (bumpiness_d, Reference.bumpiness_d),
-}
-PER_LIGHT = {"RMSE_v1", "BadPix_v_1", "BadPix_v_10", "DSSIM_v"}
+METRICS = {metric.name: metric.function for metric in catalogue()}
 every_metric = pytest.mark.parametrize("name", METRICS)
 
 
 @every_metric
 def test_metric_equals_the_protocol_in_plain_numpy(name):
-    metric, reference = METRICS[name]
     for size in ((32, 48), (41, 29)):
         maps = _maps(size)
-        value = metric(_pair(maps))[0].numpy()
-        assert value.shape == ((4,) if name in PER_LIGHT else ())
+        value = METRICS[name](_pair(maps))[0].numpy()
         assert (value > 0.001).all()  # the maps do differ in the metric's eyes
-        np.testing.assert_allclose(value, reference(_reference(maps)), rtol=1e-6)
+        np.testing.assert_allclose(value, _reference(maps)[name], rtol=1e-6)
 
 
 @every_metric
@@ -94,8 +67,7 @@ def test_metric_equals_the_protocol_in_plain_numpy(name):
 def test_metric_with_holes_equals_that_of_the_valid_pixels(name, masked):
     maps = _maps((41, 29), holes=True)
     mask = np.random.default_rng(5).random((41, 29)) < 0.98 if masked else None
-    metric, reference = METRICS[name]
-    np.testing.assert_allclose(metric(_pair(maps, mask))[0].numpy(), reference(_reference(maps, mask)), rtol=1e-6)
+    np.testing.assert_allclose(METRICS[name](_pair(maps, mask))[0].numpy(), _reference(maps, mask)[name], rtol=1e-6)
 
 
 def test_wall_offset_is_measured_along_the_rays():
@@ -104,6 +76,7 @@ def test_wall_offset_is_measured_along_the_rays():
     expected = 0.1 * np.sqrt((np.linalg.norm(camera.rays().numpy(), axis=0) ** 2).mean())
     assert rmse_d(pair).item() == pytest.approx(expected, rel=1e-12)
     assert rmse_v(pair).item() == pytest.approx(0, abs=1e-12)
+    torch.testing.assert_close(mse_v(_pair(_maps())), rmse_v(_pair(_maps())) ** 2)
 
 
 @every_metric
@@ -112,8 +85,7 @@ def test_metric_of_float32_renderings_equals_float64_to_a_ten_thousandth(name):
     wide = _pair(maps)
     narrow = SurfacePair(wide.prediction, wide.target, wide.rays, wide.depth_mask, image_dtype=torch.float32)
     assert narrow.normals[0].dtype == torch.float32
-    metric = METRICS[name][0]
-    torch.testing.assert_close(metric(narrow).double(), metric(wide), rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(METRICS[name](narrow).double(), METRICS[name](wide), rtol=1e-4, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", [name for name in METRICS if not name.startswith("BadPix")])
@@ -122,7 +94,7 @@ def test_gradients_are_finite_and_zero_at_holes(name, holes):
     maps = _maps(holes=holes)
     depth = torch.from_numpy(maps.prediction)[None, None].requires_grad_()
     pair = SurfacePair(depth, torch.from_numpy(maps.target)[None, None], maps.camera.rays()[None])
-    METRICS[name][0](pair).sum().backward()
+    METRICS[name](pair).sum().backward()
     assert bool(depth.grad.isfinite().all())
     assert bool(depth.grad.any())
     if holes:
@@ -157,7 +129,7 @@ def test_non_positive_depth_is_a_hole(name):
     for wrong in (np.nan, 0.0, -3.0):
         prediction = maps.prediction.copy()
         prediction[3:9, 4:20] = wrong
-        values.append(METRICS[name][0](_pair(maps._replace(prediction=prediction))))
+        values.append(METRICS[name](_pair(maps._replace(prediction=prediction))))
     assert torch.equal(values[0], values[1])
     assert torch.equal(values[0], values[2])
 

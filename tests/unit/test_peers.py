@@ -102,14 +102,6 @@ def test_map_of_any_ratio_is_fed_in_its_range_type(size_lr, scale, range_type):
     torch.testing.assert_close(depth, expected, rtol=1e-5, atol=0)
 
 
-def test_range_is_that_of_the_low_resolution_map():
-    upsampler, sample = Peer(Enlarged()), _sample(scale=1)
-    upsampler(sample)
-    [values] = upsampler.net.seen
-    assert (float(values.min()), float(values.max())) == pytest.approx((0, 1), abs=1e-6)
-    assert upsampler.flag == ""
-
-
 def test_weights_trained_on_a_range_of_depth_get_depth_normalised_by_it():
     class Metric(Enlarged):
         depth_range = (1.0, 9.0)
@@ -153,13 +145,6 @@ def test_holes_are_inpainted_before_the_range_is_taken():
     depth = Peer(Enlarged())(pierced)
     expected = from_range(inpaint(pierced.disparity_lr()[None])[0], sample.camera, "disparity")
     torch.testing.assert_close(depth, expected, rtol=1e-5, atol=0)
-
-
-def test_constant_map_stays_constant():
-    sample = _sample()
-    flat = torch.full_like(sample.depth_lr, 2.5)
-    depth = Peer(Enlarged())(DepthSample("t", "s", sample.rgb, flat, sample.camera, sample.camera_lr, 4))
-    torch.testing.assert_close(depth, torch.full_like(depth, 2.5))
 
 
 def test_tiles_change_rounding_errors_only_and_bfloat16_a_little():
@@ -372,22 +357,6 @@ def test_fdkn_sums_the_map_at_deformed_positions_of_a_window():
     torch.testing.assert_close(local_filters._sample(values, weights, offsets)[0, 0], expected, rtol=1e-4, atol=1e-4)
 
 
-def test_fdkn_changes_a_constant_map_by_a_constant_at_the_border_only():
-    torch.manual_seed(0)
-    net = FDKN(8).eval()
-    found = net(torch.rand(1, 3, 40, 40), torch.full((1, 1, 40, 40), 0.5))
-    torch.testing.assert_close(found[..., 12:-12, 12:-12], torch.full((1, 1, 16, 16), 0.5), rtol=0, atol=1e-5)
-
-
-def test_pgsr_plane_with_a_fixed_normal_has_the_depth_of_its_distance():
-    planes = torch.tensor([0.0, 0.0, 3.0, 4.0]).view(1, 4, 1, 1).expand(1, 4, 5, 6)
-    normalised = pgsr._normalise(planes)
-    torch.testing.assert_close(normalised[:, 2], torch.ones(1, 5, 6))
-    torch.testing.assert_close(pgsr._evaluate(normalised), torch.full((1, 1, 5, 6), 1 / 4))
-    behind = pgsr._evaluate(-normalised * torch.tensor([1.0, 1, 1, -1]).view(1, 4, 1, 1))
-    torch.testing.assert_close(behind, torch.ones(1, 1, 5, 6))  # no farther than 1
-
-
 def test_pgsr_planes_have_the_authors_coordinates():
     planes = torch.rand(1, 4, 5, 8) + 0.1
     p, q, r, s = planes[0].double().numpy()
@@ -500,27 +469,6 @@ def test_chunks_and_strips_change_rounding_errors_only(monkeypatch):
         whole = run()
         monkeypatch.setattr(module, name, size)
         torch.testing.assert_close(run(), whole, rtol=1e-5, atol=1e-6)
-
-
-def test_dornet_folds_batch_normalisation_into_convolutions_with_and_without_a_bias():
-    generator = torch.Generator().manual_seed(0)
-    x = torch.randn(1, 24, 8, 8, generator=generator)
-    for conv, norm, has_bias in (
-        ("Enc.E.0", "Enc.E.1", True),
-        ("Enc.E_pre.1.shortcut.0", "Enc.E_pre.1.shortcut.1", False),
-    ):
-        weight = torch.randn(48, 24, 3, 3, generator=generator)
-        bias = torch.randn(48, generator=generator) if has_bias else None
-        parts = {part: torch.rand(48, generator=generator) + 0.5 for part in ("weight", "bias")}
-        statistics = {part: torch.rand(48, generator=generator) + 0.5 for part in ("running_mean", "running_var")}
-        tensors = {f"{conv}.weight": weight, **{f"{norm}.{name}": each for name, each in (parts | statistics).items()}}
-        tensors |= {f"{norm}.num_batches_tracked": torch.tensor(7), "Dab.fc1.weight": weight}
-        tensors |= {} if bias is None else {f"{conv}.bias": bias}
-        converted = DORNet.convert(tensors)
-        assert set(converted) == {f"{conv}.weight", f"{conv}.bias"}
-        expected = functional.batch_norm(functional.conv2d(x, weight, bias), **statistics, **parts)
-        folded = functional.conv2d(x, converted[f"{conv}.weight"], converted[f"{conv}.bias"])
-        torch.testing.assert_close(folded, expected, atol=1e-4, rtol=1e-4)
 
 
 def test_dornet_has_a_range_of_depth_with_the_weights_for_a_phone_alone():

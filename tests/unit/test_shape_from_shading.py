@@ -20,7 +20,6 @@ from dsr.methods.classical.shape_from_shading import (
     ShapeFromShading,
     compute_shading,
     compute_surface,
-    conjugate_gradients,
     fit_lighting,
 )
 from dsr.sample import Scene
@@ -46,13 +45,6 @@ def _two(size=24, noise=0.03):
     shading = torch.from_numpy(0.5 + 0.4 * u / size + 0.1 * np.sin(v)).expand(1, 3, size, size)
     rgb = albedo[None] * shading + noise * torch.from_numpy(rng.normal(size=(1, 3, size, size)))
     return rgb, shading, disc
-
-
-def test_two_regions_under_noise_are_found_exactly():
-    rgb, shading, disc = _two()
-    regions = fuse(rgb, shading, 0.05, _everywhere(rgb))
-    assert regions.number == 2
-    assert torch.equal(regions.labels[0] == regions.labels[0, 13, 11], disc)
 
 
 def test_albedo_of_a_region_is_the_least_squares_one():
@@ -87,15 +79,6 @@ def test_row_of_pixels_is_cut_as_by_an_exhaustive_search():
         key=lambda labels: _energy(rgb, shading, Regions(labels.reshape(1, 1, 8), 8), 0.02),
     )
     assert torch.equal(fuse(rgb, shading, 0.02, _everywhere(rgb)).labels.reshape(-1), best)
-
-
-def test_regions_of_a_batch_are_those_of_its_pictures():
-    rgb, shading, _ = _two()
-    rgb, shading = torch.cat((rgb, rgb.flip(-1))), torch.cat((shading, shading.flip(-1)))
-    together = fit_albedo(rgb, shading, fuse(rgb, shading, 0.05, _everywhere(rgb)))
-    for number in range(2):
-        one = rgb[number : number + 1], shading[number : number + 1]
-        torch.testing.assert_close(together[number], fit_albedo(*one, fuse(*one, 0.05, _everywhere(one[0])))[0])
 
 
 def test_pixels_outside_stay_alone_and_separate_the_inside():
@@ -190,13 +173,6 @@ def test_normals_of_a_shaded_surface_are_better_than_those_of_bicubic(build, are
     sample = _sample(truth, _lit(truth))
     bicubic = _angle(Interpolation("bicubic")(sample)[0], truth)
     assert _angle(ShapeFromShading(iterations=15, area_weight=area_weight)(sample)[0], truth) < share * bicubic
-
-
-@pytest.mark.parametrize("mask", [False, True])
-def test_slopes_and_their_adjoint_have_transposed_matrices(mask):
-    slopes = _solver(mask=mask).slopes
-    back = _dense(slopes.adjoint, (3, 16, 16))
-    np.testing.assert_allclose(back, _dense(slopes, (1, 16, 16)).T, atol=1e-14)
 
 
 @pytest.mark.parametrize(("holes", "mask"), [(False, False), (True, False), (False, True)])
@@ -368,13 +344,3 @@ def test_light_on_a_flat_wall_is_the_smallest_that_explains_it():
     albedo = torch.ones(1, 1, 4, 5).double()
     light = fit_lighting(0.6 * albedo, albedo, normals, torch.ones_like(albedo))
     torch.testing.assert_close(light, torch.tensor([[[0.0, 0.0, -0.3, 0.3]]]).double())
-
-
-def test_conjugate_gradients_solve_each_element_of_a_batch_and_leave_a_solved_one_unchanged():
-    rng = np.random.default_rng(0)
-    root = torch.from_numpy(rng.normal(size=(3, 12, 12)))
-    matrices, right = root @ root.mT + torch.eye(12).double(), torch.from_numpy(rng.normal(size=(3, 12)))
-    right[0] = 0
-    found = conjugate_gradients(lambda x: (matrices @ x[..., None])[..., 0], right, 100, 1e-12)
-    torch.testing.assert_close(found[1:], torch.linalg.solve(matrices[1:], right[1:]))
-    assert torch.equal(found[0], torch.zeros(12).double())

@@ -13,11 +13,10 @@ from dsr.methods.networks.dynamic_guidance import (
     WIDTHS,
     DynamicGuidance,
     Stage,
-    influence,
     polynomial_filters,
 )
 from dsr.methods.networks.network import NetworkUpsampler
-from dsr.methods.networks.pdn import PrimalDualNetwork, UnrolledHuber, half_window, pair_differences, pair_sums
+from dsr.methods.networks.pdn import PrimalDualNetwork, UnrolledHuber, half_window, pair_differences
 
 
 def _random(*shape, seed=0):
@@ -48,13 +47,6 @@ def _photo(height, width, count=1):
 
 def _map(height, width, count=1):
     return 20 + 9 * _random(count, 1, height, width, seed=4)
-
-
-def test_window_sums_are_the_adjoint_of_zero_padded_differences():
-    x, p = _random(2, 1, 6, 7), _random(2, 12, 8, 11, seed=1)
-    padded = functional.pad(x, (4, 4, 2, 2))
-    left = (pair_differences(padded, 5) * p).sum()
-    torch.testing.assert_close(left, (x * pair_sums(p, 5)).sum())
 
 
 def test_unrolled_stage_equals_a_plain_loop():
@@ -181,14 +173,6 @@ def _stage(*, filters=5, size=5):
     return stage
 
 
-def _penalty(z, heights):
-    """Return rho(z) of the responses of L filters, (B, L, H, W), for the heights of their penalties, (L, 6)."""
-    total = torch.zeros_like(z)
-    for height, width in zip(heights.T, WIDTHS, strict=True):
-        total = total + height[:, None, None] * (0.5 * width**2) * torch.log1p((z / width) ** 2)
-    return total
-
-
 @pytest.mark.parametrize("size", [3, 4, 7])
 def test_filters_are_orthonormal_and_blind_to_what_the_first_ones_see(size):
     v, u = torch.meshgrid(torch.arange(size).double(), torch.arange(size).double(), indexing="ij")
@@ -197,27 +181,6 @@ def test_filters_are_orthonormal_and_blind_to_what_the_first_ones_see(size):
     torch.testing.assert_close(flat @ flat.T, torch.eye(size**2).double(), rtol=0, atol=1e-12)
     for each, blind in ((v - v + 1, basis[1:]), (u, basis[3:]), (v, basis[3:])):
         assert float((blind * each).sum(dim=(1, 2)).abs().max()) < 1e-11
-
-
-def test_influence_is_the_derivative_of_the_penalty():
-    z = torch.tensor([-2.0, -0.3, -4e-3, 0.0, 1e-3, 0.02, 0.7], dtype=torch.float64).view(1, 1, 1, 7)
-    heights = torch.tensor([[1.0, -0.5, 0.3, 2.0, -1.0, 0.1]], dtype=torch.float64)
-    z.requires_grad_()
-    (expected,) = torch.autograd.grad(_penalty(z, heights).sum(), z)
-    torch.testing.assert_close(influence(z, heights), expected, rtol=1e-12, atol=1e-15)
-    one = sum(float(a) / (1 + (0.02 / width) ** 2) for a, width in zip(heights[0], WIDTHS, strict=True))
-    assert float(influence(z, heights)[0, 0, 0, 5].detach()) == pytest.approx(0.02 * one, rel=1e-12)
-
-
-def test_stage_is_a_gradient_step_on_its_energy_and_one_towards_the_low_resolution_map():
-    stage, rgb = _stage(), photos(16, 20, 2).double()
-    coarse = maps(4, 5, 2) / 30
-    x = repeat_blocks(coarse, 4) + 0.1 * maps(16, 20, 2)
-    y = (x - stage.fidelity * upsample_linear_border(box_mean(x, 4) - coarse, 4)).requires_grad_()
-    penalties = _penalty(functional.conv2d(y, stage.filters(y)), stage.heights / len(stage.heights))
-    (gradient,) = torch.autograd.grad((stage.weights(rgb) * penalties).sum(), y)
-    assert float(gradient.abs().max()) > 1e-2
-    torch.testing.assert_close(stage(x, coarse, rgb), y.detach() - gradient, rtol=0, atol=1e-13)
 
 
 def test_stage_equals_plain_loops():
