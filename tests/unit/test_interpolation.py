@@ -146,15 +146,6 @@ def test_hole_stays_a_hole_and_does_not_spread():
     torch.testing.assert_close(found[~holes], torch.full((1920 - 16,), 2.0, dtype=torch.float64))
 
 
-def test_disparity_below_infinity_is_a_hole():
-    sample = _cubic_convolution_sample("disparity", 4)
-    far = from_range(torch.full((1, 10, 12), -0.999, dtype=torch.float64), sample.camera_lr, "disparity")
-    far[0, 5, 5] = 1.0
-    found = CubicConvolution()(DepthSample(**{**vars(sample), "depth_lr": far}))
-    assert 0 < int(found.isnan().sum()) < 800
-    assert bool((found[found.isfinite()] > 0).all())
-
-
 def test_map_of_the_photos_own_size_is_returned_and_any_ratio_is_taken():
     depth = torch.from_numpy(1 + np.random.default_rng(0).random((1, 40, 48)))
     sample = DepthSample("set", "random", torch.zeros(3, 40, 48), depth, SMALL, SMALL, 1)
