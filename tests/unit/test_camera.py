@@ -63,18 +63,6 @@ def test_rescaled_camera_has_the_parameters_of_the_protocol(factor):
     assert coarse.baseline == 0.16
 
 
-@pytest.mark.parametrize("factor", [2, 4, 8])
-@pytest.mark.parametrize("offset", ["middle", "first"])
-def test_decimated_camera_has_the_rays_of_the_kept_pixels(factor, offset):
-    start = factor // 2 if offset == "middle" else 0
-    coarse = STEREO.decimate(factor, start)
-    kept = (..., slice(start, None, factor), slice(start, None, factor))
-    torch.testing.assert_close(coarse.rays(), STEREO.rays()[kept], rtol=0, atol=1e-14)
-    depth = _depth(STEREO)
-    expected = to_range(depth, STEREO, "disparity")[kept] / factor  # disparity is in pixels of its own map
-    torch.testing.assert_close(to_range(depth[kept], coarse, "disparity"), expected, rtol=1e-13, atol=1e-13)
-
-
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("range_type", RANGE_TYPES)
 def test_range_types_have_their_defined_values_and_are_converted_back(camera, range_type):

@@ -1,4 +1,4 @@
-"""Nothing is left behind on the CPU: methods, metrics, losses and trainings on a GPU, a pretended one by default.
+"""Nothing is left behind on the CPU: methods, samples and metrics on a GPU, a pretended one by default.
 
 The results have to be those of the CPU. ``DSR_DEVICE=cuda`` runs the same tests on a real GPU.
 """

@@ -7,7 +7,7 @@ from PIL import Image
 from scipy import ndimage
 
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.geometry.camera import RANGE_TYPES, Camera, from_range, to_range
 from dsr.methods.classical.interpolation import CubicConvolution, Interpolation
 from dsr.sample import DepthSample, Scene
 from dsr.utils.ratios import SCALES
@@ -118,7 +118,7 @@ def _pillow(values, height, width):
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8])
-@pytest.mark.parametrize("range_type", ["disparity", "orthogonal"])
+@pytest.mark.parametrize("range_type", RANGE_TYPES)
 def test_down_and_up_is_pillows_bicubic(range_type, scale):
     sample = _cubic_convolution_sample(range_type, scale)
     true = to_range(sample.depth, SMALL, range_type)

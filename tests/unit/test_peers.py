@@ -1,6 +1,5 @@
 """The published networks of the field: how they are fed and read, and each part against an independent computation."""
 
-import math
 import pickle
 from typing import ClassVar
 
@@ -329,15 +328,6 @@ def test_svlrm_is_fed_the_map_shifted_by_the_authors_sampling(scale):
     np.testing.assert_allclose(found[0, 0].numpy(), expected, atol=2e-6)
 
 
-def test_svlrm_is_linear_in_the_grey_photo():
-    net = SVLRM(4)
-    net.final_layer.weight.data.zero_()
-    net.final_layer.bias.data = torch.tensor([2.0, 0.25])
-    rgb = torch.rand(1, 3, 8, 8)
-    grey = 0.299 * rgb[:, :1] + 0.587 * rgb[:, 1:2] + 0.114 * rgb[:, 2:]
-    torch.testing.assert_close(net(rgb, torch.rand(1, 1, 8, 8)), 2 * grey + 0.25)
-
-
 def test_fdkn_sums_the_map_at_deformed_positions_of_a_window():
     torch.manual_seed(0)
     height, width, side = 9, 11, 15
@@ -380,15 +370,6 @@ def test_dct2_and_idct2_are_scipys_transforms(size):
     np.testing.assert_allclose(idct2(x).numpy(), scipy.fft.idctn(x.numpy(), axes=(-2, -1)), atol=1e-13)
 
 
-def test_dct2_of_float32_is_float32_and_accurate():
-    x = random(2, 48, 50, dtype=torch.float32)
-    coefficients = dct2(x)
-    assert coefficients.dtype == torch.float32
-    expected = scipy.fft.dctn(x.double().numpy(), axes=(-2, -1))
-    np.testing.assert_allclose(coefficients.numpy(), expected, atol=1e-6 * np.abs(expected).max())
-    torch.testing.assert_close(idct2(coefficients), x, atol=2e-6, rtol=0)
-
-
 @pytest.mark.parametrize("size", [(3, 4), (4, 3)])
 def test_dct2_and_idct2_have_the_right_gradients(size):
     x = random(*size).requires_grad_()
@@ -428,25 +409,14 @@ def make_inputs(batch=2, channels=3, outputs=4, height=5, width=6):
     )
 
 
-def interpolate(image, y, x):
-    """The bilinear value of (H, W) at a position; 0 outside."""
-    value = 0.0
-    for row in (math.floor(y), math.floor(y) + 1):
-        for column in (math.floor(x), math.floor(x) + 1):
-            if 0 <= row < image.shape[0] and 0 <= column < image.shape[1]:
-                value += (1 - abs(y - row)) * (1 - abs(x - column)) * image[row, column]
-    return value
-
-
 def convolve_in_loops(x, offsets, mask, weight):
-    batch, channels, height, width = x.shape
+    batch, _, height, width = x.shape
+    rows, columns = np.mgrid[:height, :width]
     result = np.zeros((batch, weight.shape[1], height, width))
-    for b, row, column, tap in np.ndindex(batch, height, width, 9):
-        dy, dx = offsets[b, 2 * tap : 2 * tap + 2, row, column]
-        y, x_position = row + tap // 3 - 1 + dy, column + tap % 3 - 1 + dx
-        for channel in range(channels):
-            value = mask[b, tap, row, column] * interpolate(x[b, channel], y, x_position)
-            result[b, :, row, column] += weight[b, :, channel, tap // 3, tap % 3] * value
+    for b, tap in np.ndindex(batch, 9):
+        places = rows + tap // 3 - 1 + offsets[b, 2 * tap], columns + tap % 3 - 1 + offsets[b, 2 * tap + 1]
+        values = [scipy.ndimage.map_coordinates(each, places, order=1, mode="grid-constant") for each in x[b]]
+        result[b] += np.tensordot(weight[b, :, :, tap // 3, tap % 3], mask[b, tap] * values, 1)
     return result
 
 
@@ -469,6 +439,27 @@ def test_chunks_and_strips_change_rounding_errors_only(monkeypatch):
         whole = run()
         monkeypatch.setattr(module, name, size)
         torch.testing.assert_close(run(), whole, rtol=1e-5, atol=1e-6)
+
+
+def test_dornet_folds_batch_normalisation_into_convolutions_with_and_without_a_bias():
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(1, 24, 8, 8, generator=generator)
+    for conv, norm, has_bias in (
+        ("Enc.E.0", "Enc.E.1", True),
+        ("Enc.E_pre.1.shortcut.0", "Enc.E_pre.1.shortcut.1", False),
+    ):
+        weight = torch.randn(48, 24, 3, 3, generator=generator)
+        bias = torch.randn(48, generator=generator) if has_bias else None
+        parts = {part: torch.rand(48, generator=generator) + 0.5 for part in ("weight", "bias")}
+        statistics = {part: torch.rand(48, generator=generator) + 0.5 for part in ("running_mean", "running_var")}
+        tensors = {f"{conv}.weight": weight, **{f"{norm}.{name}": each for name, each in (parts | statistics).items()}}
+        tensors |= {f"{norm}.num_batches_tracked": torch.tensor(7), "Dab.fc1.weight": weight}
+        tensors |= {} if bias is None else {f"{conv}.bias": bias}
+        converted = DORNet.convert(tensors)
+        assert set(converted) == {f"{conv}.weight", f"{conv}.bias"}
+        expected = functional.batch_norm(functional.conv2d(x, weight, bias), **statistics, **parts)
+        folded = functional.conv2d(x, converted[f"{conv}.weight"], converted[f"{conv}.bias"])
+        torch.testing.assert_close(folded, expected, atol=1e-4, rtol=1e-4)
 
 
 def test_dornet_has_a_range_of_depth_with_the_weights_for_a_phone_alone():
