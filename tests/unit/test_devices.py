@@ -89,6 +89,7 @@ def _pair(device):
     return SurfacePair(prediction.to(device), target.to(device), sample.camera.rays(device=device)[None])
 
 
+@pytest.mark.slow
 def test_metrics_have_the_values_of_the_cpu(gpu, monkeypatch):
     monkeypatch.setattr(evalmde, "PAIRS", 10**4)  # whose drawing takes most of the time
     monkeypatch.setattr(evalmde, "sobol_pairs", evalmde.sobol_pairs.__wrapped__)  # so few are not kept for others

@@ -204,6 +204,7 @@ def test_probabilities_have_single_precision_and_no_gradient(dtype):
     assert probability_of_glass(rgb[:, :3, :4], inverse[:, :1, :2]).shape == (1, 3, 4)
 
 
+@pytest.mark.slow
 def test_wrong_depth_of_simulated_vessels_is_ranked_first_and_expected_to_be_wrong():
     source, aucs = Procedural(4, size=192, seed=5), []
     for number, name in enumerate(source.scenes()):

@@ -166,6 +166,7 @@ def counted(constant, unit=1e-4, noise=0.0):
     return as_stored(constant / np.round(inverse * constant), unit)
 
 
+@pytest.mark.slow
 def test_sensor_is_identified_by_what_is_given_then_by_values_then_by_files():
     stereo = counted(1024)
     assert identify(stereo)[:2] == (BY_NAME["RealSense D435"], "values")
@@ -224,6 +225,7 @@ def test_systematic_error_of_a_known_sensor_is_added_to_the_stated_one():
     assert torch.equal(found["none"].angle_error, found["Azure Kinect"].angle_error)
 
 
+@pytest.mark.slow
 def test_correlated_noise_of_a_stereo_camera_is_given_as_it_grows():
     depth = counted(1024, 1e-3, noise=0.004)[PART]
     found = find_noise(depth)

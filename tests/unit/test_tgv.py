@@ -34,6 +34,7 @@ def test_tensor_root_has_the_eigenvalues_of_the_paper():
     torch.testing.assert_close(torch.linalg.eigvalsh(matrices)[:, 1], torch.ones(42).double())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("data_weight", "holes"), [(None, True), (20.0, False)])
 def test_objective_reaches_that_of_another_algorithm(data_weight, holes):
     """Within 1e-3, on 16 x 16 pixels with depth steps, slopes and noise: ADMM with exact solves."""
