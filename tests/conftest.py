@@ -47,14 +47,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     ``shared`` tests need the shared material, ``browser`` tests a browser, and ``slow`` tests run whole commands or are
     marked so. All others are ``unit``. Campaigns, and what is marked so, are ``nightly``: `make test` leaves them out.
+    The first test of each file of a command is ``command``, too: it shows that the command works.
     """
+    files = set()
     for item in items:
+        if item.path not in files and item.path.stem.endswith(("_command", "_commands")):
+            item.add_marker("command")
+        files.add(item.path)
         fixtures = getattr(item, "fixturenames", ())
         if "shared" in fixtures:
             item.add_marker("shared")
         if "browser" in fixtures:
             item.add_marker("browser")
-        if UNIT_TESTS not in item.path.parents:
+        if UNIT_TESTS not in item.path.parents or "in_process" in fixtures:
             item.add_marker("slow")
         if any(folder in item.path.parents for folder in NIGHTLY):
             item.add_marker("nightly")

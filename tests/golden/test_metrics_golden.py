@@ -4,44 +4,27 @@
 """
 
 import json
-from functools import cache
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.geometry.camera import Camera, from_range
+from dsr.geometry.camera import from_range
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.metrics.catalogue import Score, catalogue, score_image
 from dsr.metrics.formats import in_tables
-from dsr.metrics.lpips import LPIPS, load_lpips
+from dsr.metrics.lpips import LPIPS
 from dsr.report.paper import published_row
 from dsr.sample import Scene
 
 METHODS = {"Bicubic": None, "MSG-V": "msg_v", "MSG": "msg"}
 COVERED = {"Bicubic": 512, "MSG-V": 512, "MSG": 511}
 LIGHTS = ("e1", "e2", "e3", "e4")
-
-
-@pytest.fixture(scope="module")
-def network(shared: Path) -> LPIPS:
-    return load_lpips(shared / "weights" / "alexnet_imagenet_features.pth")
-
-
-@cache
-def _scene(shared: Path, name: str) -> Scene:
-    folder = shared / "scenes" / name
-    stored = json.loads((folder / "camera.json").read_text())
-    camera = Camera(**{key: stored[key] for key in ("width", "height", "fx", "fy", "cx", "cy", "baseline", "doffs")})
-    with Image.open(folder / "rgb.png") as image:
-        rgb = torch.from_numpy(np.array(image.convert("RGB"))).permute(2, 0, 1) / 255
-    disparity = torch.from_numpy(np.load(folder / "disparity.npy").astype(np.float64))[None]
-    return Scene("golden", name, rgb, camera, from_range(disparity, camera, "disparity"))
 
 
 def _prediction(shared: Path, scene: Scene, method: str, scale: int) -> Tensor:
@@ -70,9 +53,11 @@ def _check(expected: dict[str, Any], rows: dict[tuple[str, str], Score]) -> None
 @pytest.mark.parametrize("scale", [4, 8])
 @pytest.mark.parametrize("scene", ["lucy", "plant"])
 @pytest.mark.parametrize("method", METHODS)
-def test_metrics_equal_the_golden_file(shared: Path, network: LPIPS, method: str, scene: str, scale: int) -> None:
+def test_metrics_equal_the_golden_file(
+    shared: Path, load_scene: Callable[[str], Scene], network: LPIPS, method: str, scene: str, scale: int
+) -> None:
     expected = json.loads((shared / "expected" / "metrics.json").read_text())[scene][f"x{scale}"][method]
-    loaded = _scene(shared, scene)
+    loaded = load_scene(scene)
     assert loaded.depth is not None
     prediction = _prediction(shared, loaded, method, scale)
     scores = score_image(prediction, loaded.depth, loaded.camera.rays(), catalogue(network))
@@ -83,9 +68,9 @@ def test_metrics_equal_the_golden_file(shared: Path, network: LPIPS, method: str
 
 @pytest.mark.parametrize(("scene", "scale"), [("lucy", 4), ("plant", 8)])
 def test_interpolation_over_triangles_has_the_papers_scores_of_bicubic(
-    shared: Path, network: LPIPS, scene: str, scale: int
+    load_scene: Callable[[str], Scene], network: LPIPS, scene: str, scale: int
 ) -> None:
-    loaded = _scene(shared, scene)
+    loaded = load_scene(scene)
     assert loaded.depth is not None
     sample = make_sample(loaded, scale, Downsampling("box"), Interpolation.range_type)
     scores = score_image(Interpolation("clough_tocher")(sample), loaded.depth, loaded.camera.rays(), catalogue(network))

@@ -1,39 +1,34 @@
 """MSG and MSG-V with their authors' weights, against the disparity maps that the published networks give."""
 
-import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.degradation.downsampling import Downsampling, make_sample
+from dsr.geometry.camera import from_range, to_range
 from dsr.methods.images import upsample_bicubic
 from dsr.methods.networks.msg_net import VariantName
 from dsr.methods.networks.network import Precision
 from dsr.methods.networks.trained import TrainedNetwork
-from dsr.sample import DepthSample
+from dsr.sample import DepthSample, Scene
 
+Load = Callable[[str], Scene]
 FILES: dict[str, tuple[VariantName, str]] = {
     "msg_v": ("voynov", "msg_v_x{}_clean.pth"),
     "msg": ("hui", "MSGNet_x{}.caffemodel"),
 }
 
 
-def _sample(shared: Path, scene: str, scale: int) -> tuple[DepthSample, Tensor]:
+def _sample(scene: Scene, scale: int) -> tuple[DepthSample, Tensor]:
     """Return the scene with its box-downsampled disparity (as depth), and the true disparity, (1, 512, 512)."""
-    folder = shared / "scenes" / scene
-    stored = json.loads((folder / "camera.json").read_text())
-    camera = Camera(**{key: stored[key] for key in ("width", "height", "fx", "fy", "cx", "cy", "baseline", "doffs")})
-    coarse = camera.rescale(camera.width // scale, camera.height // scale)
-    disparity = torch.from_numpy(np.load(folder / "disparity.npy"))[None]
-    with Image.open(folder / "rgb.png") as image:
-        rgb = torch.from_numpy(np.array(image.convert("RGB"))).permute(2, 0, 1) / 255
-    depth_lr = from_range(functional.avg_pool2d(disparity, scale) / scale, coarse, "disparity")
-    return DepthSample("golden", scene, rgb, depth_lr, camera, coarse, scale), disparity
+    assert scene.depth is not None
+    sample = make_sample(scene, scale, Downsampling("box"), "disparity")
+    return sample, to_range(scene.depth, scene.camera, "disparity")
 
 
 def _upsampled(shared: Path, method: str, sample: DepthSample, precision: Precision = "float32") -> Tensor:
@@ -54,8 +49,10 @@ def _rmse_mm(sample: DepthSample, disparity: Tensor, truth: Tensor) -> float:
 @pytest.mark.parametrize("scale", [4, 8])
 @pytest.mark.parametrize("scene", ["lucy", "plant"])
 @pytest.mark.parametrize("method", ["msg_v", "msg"])
-def test_output_is_that_of_the_published_network(shared: Path, method: str, scene: str, scale: int) -> None:
-    sample, _ = _sample(shared, scene, scale)
+def test_output_is_that_of_the_published_network(
+    shared: Path, load_scene: Load, method: str, scene: str, scale: int
+) -> None:
+    sample, _ = _sample(load_scene(scene), scale)
     expected = torch.from_numpy(np.load(shared / "expected" / f"{method}_{scene}_x{scale}.npy")).double()
     rows, columns = expected.shape
     ours = _upsampled(shared, method, sample)
@@ -66,20 +63,20 @@ def test_output_is_that_of_the_published_network(shared: Path, method: str, scen
 
 
 @pytest.mark.parametrize("scale", [2, 16])
-def test_other_published_networks_are_better_than_bicubic_too(shared: Path, scale: int) -> None:
-    sample, truth = _sample(shared, "lucy", scale)
+def test_other_published_networks_are_better_than_bicubic_too(shared: Path, load_scene: Load, scale: int) -> None:
+    sample, truth = _sample(load_scene("lucy"), scale)
     bicubic = upsample_bicubic(functional.avg_pool2d(truth, scale)[None], scale)[0, 0]
     assert _rmse_mm(sample, _upsampled(shared, "msg", sample), truth[0]) < 0.9 * _rmse_mm(sample, bicubic, truth[0])
 
 
-def test_network_trained_on_noise_loads_and_stays_near_the_truth(shared: Path) -> None:
-    sample, truth = _sample(shared, "lucy", 4)
+def test_network_trained_on_noise_loads_and_stays_near_the_truth(shared: Path, load_scene: Load) -> None:
+    sample, truth = _sample(load_scene("lucy"), 4)
     upsampler = TrainedNetwork(shared / "weights" / "msg_v_x4_noise_std0.003.pth", 4, "msg_v", "voynov")
     assert _rmse_mm(sample, to_range(upsampler(sample), sample.camera, "disparity")[0], truth[0]) < 60
 
 
-def test_bfloat16_changes_the_published_error_by_less_than_one_percent(shared: Path) -> None:
-    sample, truth = _sample(shared, "lucy", 4)
+def test_bfloat16_changes_the_published_error_by_less_than_one_percent(shared: Path, load_scene: Load) -> None:
+    sample, truth = _sample(load_scene("lucy"), 4)
     exact, rounded = (_upsampled(shared, "msg_v", sample, precision) for precision in ("float32", "bfloat16"))
     assert _rmse_mm(sample, exact, truth[0]) == pytest.approx(23.552, abs=0.001)
     assert _rmse_mm(sample, rounded, truth[0]) == pytest.approx(23.552, rel=0.01)

@@ -1,5 +1,6 @@
 """Published networks of the field with their authors' weights, against maps and scores of the authors' own code."""
 
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -9,17 +10,17 @@ import pytest
 import torch
 
 from dsr.data.eight_bit import EightBit
-from dsr.data.folder import Folder
 from dsr.data.rgbdd import RGBDD
 from dsr.data.scene_source import SceneSource
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import RangeType
 from dsr.methods.recipe import read_recipe
 from dsr.metrics.catalogue import catalogue, score_image
-from dsr.metrics.lpips import LPIPS, load_lpips
+from dsr.metrics.lpips import LPIPS
 from dsr.sample import Scene
 
 pytestmark = pytest.mark.nightly  # only a change in methods/networks/peers can break them
+Load = Callable[[str], Scene]
 NAMES = {"pgsr": "PGSR", "dctnet": "DCTNet", "dornet": "DORNet-T", "svlrm": "SVLRM", "fdkn": "FDKN"}
 FEEDS: dict[str, tuple[Downsampling, RangeType]] = {
     "box-disp": (Downsampling("box"), "disparity"),
@@ -46,43 +47,33 @@ SLOW = ("LPIPS_v", "Bumpiness_d")
 """Metrics that are computed for Lucy and the default settings only."""
 
 
-@pytest.fixture(scope="module")
-def network(shared: Path) -> LPIPS:
-    return load_lpips(shared / "weights" / "alexnet_imagenet_features.pth")
-
-
 @cache
-def _scene(shared: Path, name: str) -> Scene:
-    return Folder(str(shared / "scenes"), [name]).load(name)
-
-
-@cache
-def _predict(shared: Path, name: str, method: str, scale: int, variant: str) -> torch.Tensor:
+def _predict(shared: Path, load_scene: Load, name: str, method: str, scale: int, variant: str) -> torch.Tensor:
     downsampling, range_type = FEEDS[variant]
     weights = shared / "weights" / "peers"
     upsampler = read_recipe(method, {"range_type": range_type}).with_weights(weights).build(scale)
-    return upsampler(make_sample(_scene(shared, name), scale, downsampling, range_type))
+    return upsampler(make_sample(load_scene(name), scale, downsampling, range_type))
 
 
 @pytest.mark.parametrize(("method", "scale"), TRAINED)
-def test_depth_is_that_of_the_authors_code(shared: Path, method: str, scale: int) -> None:
+def test_depth_is_that_of_the_authors_code(shared: Path, load_scene: Load, method: str, scale: int) -> None:
     file = shared / "expected" / f"peer_{NAMES[method]}_lucy_x{scale}_box_disparity.npz"
     expected = torch.from_numpy(np.load(file)["depth"]).double()
-    ours = _predict(shared, "lucy", method, scale, "box-disp")[0]
+    ours = _predict(shared, load_scene, "lucy", method, scale, "box-disp")[0]
     difference = (ours - expected).abs().max() / (expected.max() - expected.min())
     assert float(difference) < 5e-5  # 2e-6 measured; FDKN 2e-5
 
 
 @pytest.mark.parametrize(("name", "method", "scale", "variant"), SETTINGS)
 def test_scores_are_those_of_the_authors_code(
-    shared: Path, network: LPIPS, name: str, method: str, scale: int, variant: str
+    shared: Path, load_scene: Load, network: LPIPS, name: str, method: str, scale: int, variant: str
 ) -> None:
     rows = pd.read_csv(shared / "expected" / "peers.csv", dtype={"scale": int})
     rows = rows[(rows["part"] == "scenes") & (rows["method"] == NAMES[method]) & (rows["scene"] == name)]
     expected = rows[(rows["scale"] == scale) & (rows["variant"] == variant)].set_index("metric")["value"]
-    scene = _scene(shared, name)
+    scene = load_scene(name)
     assert scene.depth is not None
-    depth = _predict(shared, name, method, scale, variant)
+    depth = _predict(shared, load_scene, name, method, scale, variant)
     everything = (name, variant) == ("lucy", "box-disp")
     wanted = {metric for metric, _ in COLUMNS.values() if everything or metric not in SLOW}
     metrics = tuple(metric for metric in catalogue(network) if metric.name in wanted)

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
@@ -10,17 +11,11 @@ import torch
 from commands import run_python
 from torch import Tensor
 
-from dsr.data.folder import Folder
-from dsr.data.rendered import SimGeo
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.methods.networks.network import NetworkUpsampler
-from dsr.methods.networks.trained import TrainedNetwork
 from dsr.methods.recipe import read_recipe
-from dsr.methods.weights import packaged_weights
 from dsr.metrics.catalogue import Metric, catalogue, score_image
 from dsr.metrics.formats import WORST
-from dsr.metrics.lpips import load_lpips
-from dsr.sample import DepthSample
+from dsr.sample import DepthSample, Scene
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 VISUAL = ("RMSE_v", "DSSIM_v", "BadPix_v_5", "Bumpiness_d", "LPIPS_v")
@@ -59,38 +54,20 @@ def test_visual_loss_shows_on_lucy_and_plant(ratios: pd.DataFrame) -> None:
     assert float(gain["RMSE_v"].max()) < 0.9
 
 
-@pytest.mark.parametrize(("scale", "name"), [(4, "sphere_cylinder_high_freq"), (8, "sphere_cylinder_low_freq")])
-def test_visual_loss_shows_on_simgeo(shared: Path, scale: int, name: str) -> None:
-    lpips = load_lpips(shared / "weights" / "alexnet_imagenet_features.pth")
-    metrics = tuple(metric for metric in catalogue(lpips) if metric.name in VISUAL)
-    sample = make_sample(SimGeo(size=256).load(name), scale, Downsampling("box"), "disparity")
-    scores = {model: _worst(_packaged(model, scale)(sample), sample, metrics) for model in ("msg", "msg_v")}
-    gain = {metric: scores["msg_v"][metric] / scores["msg"][metric] for metric in VISUAL}
-    assert max(gain.values()) < 1.0, gain
-
-
 @pytest.mark.parametrize(
     "name",
     ["sparse_to_dense_x4", "sparse_to_dense_x8", "ddrnet_x4", pytest.param("ddrnet_x8", marks=pytest.mark.nightly)],
 )
-def test_scores_on_lucy_are_those_that_the_recipe_expects(shared: Path, name: str) -> None:
+def test_scores_on_lucy_are_those_that_the_recipe_expects(load_scene: Callable[[str], Scene], name: str) -> None:
     header = (REPOSITORY / "conf" / "experiment" / f"{name}.yaml").read_text(encoding="utf-8")
     found = re.search(r"Expected: .*Lucy (\d+) / (\d+) / (\d+),", header)
     assert found is not None
     model, _, scale = name.rpartition("_x")
     method = read_recipe(model).build(int(scale))
-    scene = Folder(str(shared / "scenes"), ["lucy"]).load("lucy")
-    sample = make_sample(scene, int(scale), Downsampling("box"), method.range_type)
+    sample = make_sample(load_scene("lucy"), int(scale), Downsampling("box"), method.range_type)
     scores = _worst(method(sample), sample, catalogue())
     measured = [1000 * scores["RMSE_v"], 1000 * scores["DSSIM_v"], 1000 * scores["RMSE_d"]]
     assert measured == pytest.approx([float(each) for each in found.groups()], abs=0.6)
-
-
-def _packaged(model: str, scale: int) -> NetworkUpsampler:
-    """Return the network that comes with dsr, without an ensemble."""
-    weights = packaged_weights(f"{model}_x{scale}")
-    assert weights is not None
-    return TrainedNetwork(weights, scale, model, ensemble=1)
 
 
 @torch.inference_mode()

@@ -63,18 +63,6 @@ def test_rescaled_camera_has_the_parameters_of_the_protocol(factor):
     assert coarse.baseline == 0.16
 
 
-@pytest.mark.parametrize("factor", [2, 4, 8])
-@pytest.mark.parametrize("offset", ["middle", "first"])
-def test_decimated_camera_has_the_rays_of_the_kept_pixels(factor, offset):
-    start = factor // 2 if offset == "middle" else 0
-    coarse = STEREO.decimate(factor, start)
-    kept = (..., slice(start, None, factor), slice(start, None, factor))
-    torch.testing.assert_close(coarse.rays(), STEREO.rays()[kept], rtol=0, atol=1e-14)
-    depth = _depth(STEREO)
-    expected = to_range(depth, STEREO, "disparity")[kept] / factor  # disparity is in pixels of its own map
-    torch.testing.assert_close(to_range(depth[kept], coarse, "disparity"), expected, rtol=1e-13, atol=1e-13)
-
-
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("range_type", RANGE_TYPES)
 def test_range_types_have_their_defined_values_and_are_converted_back(camera, range_type):
@@ -83,14 +71,6 @@ def test_range_types_have_their_defined_values_and_are_converted_back(camera, ra
     expected = _numpy_range(depth[0].numpy(), camera, range_type)
     np.testing.assert_allclose(values[0].numpy(), expected, rtol=1e-14, atol=1e-14)
     torch.testing.assert_close(from_range(values, camera, range_type), depth, rtol=1e-12, atol=0)
-
-
-@pytest.mark.parametrize("range_type", RANGE_TYPES)
-def test_range_conversion_keeps_holes_and_adds_none(range_type):
-    depth = _depth(STEREO)
-    depth[0, 2, 3] = torch.nan
-    for values in (to_range(depth, STEREO, range_type), from_range(depth, STEREO, range_type)):
-        assert torch.equal(values.isnan(), depth.isnan())
 
 
 def test_disparity_at_or_beyond_infinity_becomes_a_hole():
@@ -298,11 +278,3 @@ def test_depth_map_in_the_photos_pixels_has_the_photos_lens(capture):
     frame = CaptureFrame("Test", lambda _: geometry, capture.depth, b"")
     found = read_picture(Pair("x", capture.rgb, capture.depth, unit=1e-3, capture=frame), Reading()).depth_lr[0].numpy()
     assert np.nanmax(np.abs(found - (2 + ideal_rays()[::2, ::2, 0]))) < 2 / 130
-
-
-@pytest.mark.parametrize("model", ["brown_conrady", "kannala_brandt"])
-def test_intrinsics_of_whole_numbers_are_those_of_floats(model):
-    picture = np.arange(64 * 48, dtype=np.float32).reshape(48, 64)
-    whole, real = (Camera(64, 48, *map(kind, (60, 60, 31, 24))) for kind in (int, float))
-    lens = Lens(model, (1, 0, 0, 0))
-    np.testing.assert_array_equal(undistort(picture, whole, lens), undistort(picture, real, lens))

@@ -1,50 +1,31 @@
-"""Nothing is left behind on the CPU: methods, metrics, losses and trainings on a GPU, a pretended one by default.
+"""Nothing is left behind on the CPU: methods, samples and metrics on a GPU, a pretended one by default.
 
 The results have to be those of the CPU. ``DSR_DEVICE=cuda`` runs the same tests on a real GPU.
 """
 
-from dataclasses import asdict, replace
-from functools import partial
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from methods_at_hand import AT_HAND
+from methods_at_hand import AT_HAND, SLOW, build
 from pretend_cuda import pretend_cuda
 from small_lpips import random_lpips
 from small_scenes import sample_of
 from torch import nn
-from torch.utils.data import default_collate
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.holes import Blobs, Shadows
 from dsr.degradation.noise import GaussianMultiplicative, Kinect, TimeOfFlight
-from dsr.degradation.random_degradation import Everything
 from dsr.inference import upsample_surface
-from dsr.methods.networks.facets_unet import FacetsUNet
-from dsr.methods.networks.msg_net import MSGNet
-from dsr.methods.networks.pdn import PrimalDualNetwork
-from dsr.methods.networks.peers.peer import PEERS
-from dsr.methods.recipe import Run, read_recipe
-from dsr.metrics import evalmde, losses
+from dsr.metrics import evalmde
 from dsr.metrics.catalogue import PROTOCOLS, catalogue, score_image
 from dsr.metrics.classes import compute_means, visual_metrics
 from dsr.metrics.functional import SurfacePair
-from dsr.metrics.losses import VisualLoss
-from dsr.sample import CENTIMETRES, Scene
-from dsr.training.degradation import Degradation
-from dsr.training.module import SuperResolution
-from dsr.training.objective import DepthObjective, SurfaceObjective
-from dsr.training.patches import Patches
-from dsr.training.settings import PatchSettings
+from dsr.sample import Scene
 from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError
 
-SHORT = {
-    "dip": {"steps": 2}, "dip_v": {"steps": 2}, "tgv": {"iterations": 20},
-    "srfs": {"iterations": 1},
-}  # fmt: skip
-SLOW = {"eg", "srfs", "dip", "dip_v"}
 METHODS = [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in AT_HAND]
 CPU = torch.device("cpu")
 
@@ -75,58 +56,15 @@ def _on(sample, device):
     return replace(sample, **maps)
 
 
-def _build(name, device, folder):
-    recipe = read_recipe(name, SHORT.get(name))
-    if "peer" in recipe.at():
-        torch.manual_seed(0)
-        weights = folder / f"{name}.pth"
-        if not weights.exists():
-            torch.save(PEERS[name](4).state_dict(), weights)
-        recipe = recipe.with_weights(weights)
-    return recipe.build(4, Run(device=device))
-
-
 @pytest.mark.parametrize("name", METHODS)
 def test_method_predicts_on_a_gpu_what_it_predicts_on_the_cpu(name, tmp_path, gpu):
     sample = _sample(96 if name == "eg" else 48)
-    expected = _build(name, CPU, tmp_path)(sample)
-    method = _build(name, gpu, tmp_path)
+    expected = build(name, tmp_path)(sample)
+    method = build(name, tmp_path, gpu)
     for given in (_on(sample, gpu),) if name in SLOW else (sample, _on(sample, gpu)):
         found = method(given)
         assert found.device == given.depth_lr.device
         torch.testing.assert_close(found.cpu(), expected, rtol=1e-3, atol=1e-3, equal_nan=True)
-
-
-@pytest.mark.parametrize("model", ["facets", "msg_v", "pdn"])
-@pytest.mark.filterwarnings("ignore:You are trying to `self.log.*")
-def test_training_step_on_a_gpu_is_that_of_the_cpu(model, gpu):
-    settings = PatchSettings(patch=32, batch=2, photo=1.0)
-    everything = Everything() if model == "facets" else None
-    noise = GaussianMultiplicative(0.01) if model == "msg_v" else None
-    degradation = Degradation(4, Downsampling("box"), noise)
-    sample = _sample()
-    scene = Scene("set", "hall", sample.rgb, sample.camera, sample.depth)
-    patches = Patches([[scene]], settings, degradation, everything=everything)
-    batch = default_collate([patches[0], patches[1]])
-    found = []
-    for device in (CPU, gpu):
-        torch.manual_seed(0)
-        net = {"facets": FacetsUNet, "msg_v": partial(MSGNet, variant="dsr"), "pdn": PrimalDualNetwork}[model](4)
-        objective = SurfaceObjective() if model == "facets" else DepthObjective("lap1", 0.1, shading=0.1)
-        module = SuperResolution(net, objective).to(device)
-        moved = {key: value.to(device) for key, value in batch.items()}
-        optimizer = module.configure_optimizers()
-        assert isinstance(optimizer, torch.optim.Optimizer)
-        loss = module.training_step(moved, 0)
-        loss.backward()
-        loss = loss.detach()
-        norm = nn.utils.clip_grad_norm_(module.net.parameters(), 1.0)
-        optimizer.step()
-        with torch.no_grad():
-            module.validation_step({**moved, "unit": asdict(CENTIMETRES)}, 0)
-        means = compute_means(module.metrics[0])
-        found.append([float(loss), float(norm), *(float(each) for each in means.values())])
-    np.testing.assert_allclose(found[1], found[0], rtol=1e-3)
 
 
 @pytest.mark.parametrize("noise", [Kinect(), TimeOfFlight(), GaussianMultiplicative(0.01)])
@@ -151,6 +89,7 @@ def _pair(device):
     return SurfacePair(prediction.to(device), target.to(device), sample.camera.rays(device=device)[None])
 
 
+@pytest.mark.slow
 def test_metrics_have_the_values_of_the_cpu(gpu, monkeypatch):
     monkeypatch.setattr(evalmde, "PAIRS", 10**4)  # whose drawing takes most of the time
     monkeypatch.setattr(evalmde, "sobol_pairs", evalmde.sobol_pairs.__wrapped__)  # so few are not kept for others
@@ -165,31 +104,6 @@ def test_metrics_have_the_values_of_the_cpu(gpu, monkeypatch):
         network.to(CPU)
     np.testing.assert_allclose(found[1], found[0], rtol=1e-4)
     assert len(found[0]) > 40
-
-
-def _depth_loss(pair, loss):
-    return loss(*pair.given)
-
-
-LOSSES = {
-    **{each.__name__: partial(partial, _depth_loss, loss=each) for each in (losses.l1, losses.mse, losses.lap1)},
-    "mse_v": VisualLoss,
-    "dssim": lambda: VisualLoss("dssim"),
-    "lpips": lambda: VisualLoss("lpips", random_lpips()),
-}
-
-
-@pytest.mark.parametrize("name", LOSSES)
-def test_losses_and_their_gradients_are_those_of_the_cpu(name, gpu):
-    found = []
-    for device in (CPU, gpu):
-        pair = _pair(device)
-        prediction = pair.given[0].detach().requires_grad_()
-        value = LOSSES[name]()(SurfacePair(prediction, pair.given[1], pair.rays)).sum()
-        (gradient,) = torch.autograd.grad(value, prediction)
-        found.append((value.detach().cpu(), gradient.cpu()))
-    for expected, other in zip(*found, strict=True):
-        torch.testing.assert_close(other, expected, rtol=1e-4, atol=1e-6, equal_nan=True)
 
 
 @pytest.mark.parametrize("method", ["facets", "bicubic"])

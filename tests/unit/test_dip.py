@@ -7,7 +7,6 @@ import torch
 from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.degradation.holes import Blobs
 from dsr.geometry.camera import Camera
 from dsr.methods.dip.upsampler import DeepImagePrior, PriorOptimisation, SkipNet, levels_for, upsample_2x
 from dsr.methods.images import mean3x3
@@ -96,16 +95,6 @@ def test_dip_approximates_two_planes_and_the_visual_loss_gives_better_normals():
         assert _error(depth, sample) < 0.25 * _error(flat, sample)
         errors.append(float(rmse_v(SurfacePair(depth[None], sample.depth[None], CAMERA.rays()[None]))))
     assert errors[0] < 0.8 * errors[1]
-
-
-@pytest.mark.slow
-def test_holes_are_filled_better_than_with_the_nearest_values():
-    sample = _sample(holes=Blobs(0.15, 8))
-    depth = _prior(**ENOUGH)(sample)
-    assert bool(depth.isfinite().all())
-    holes = sample.depth_lr.isnan().repeat_interleave(2, 1).repeat_interleave(2, 2)
-    flat = torch.full_like(depth, float(sample.depth_lr.nanmean()))
-    assert _error(depth, sample, holes) < 0.3 * _error(flat, sample, holes)
 
 
 @pytest.mark.parametrize("steps", [3, 150])

@@ -1,4 +1,4 @@
-"""Edge-guided upsampling: planes, straight steps, holes, and the filter against a plain loop."""
+"""Edge-guided upsampling: straight steps, and its parts against plain loops and exhaustive search."""
 
 import itertools
 import math
@@ -15,17 +15,11 @@ from dsr.methods.classical.edge_guided import (
     PATCH,
     EdgeGuided,
     bilateral_filter,
-    deduplicate,
-    detect_edges,
     edge_distances,
     energy,
-    find_nearest,
     find_overlaps,
     find_reachable,
     label,
-    orient,
-    predict_edge_map,
-    thin,
 )
 from dsr.methods.classical.guided_filter import estimate_slopes
 from dsr.methods.classical.interpolation import Interpolation
@@ -40,7 +34,7 @@ def _step(size, degrees):
 
 
 @pytest.mark.parametrize("scale", [2, 4])
-@pytest.mark.parametrize("degrees", [0.0, 10.0, 30.0])
+@pytest.mark.parametrize("degrees", [0.0, 30.0])
 @pytest.mark.parametrize("turned", [False, True])
 def test_eg_keeps_a_straight_step_straight_and_sharp(scale, degrees, turned):
     """Each row's edge is nearer than half a low-resolution pixel to the line; bicubic smears it over more pixels."""
@@ -143,30 +137,3 @@ def test_distances_equal_scipy_and_overlaps_equal_a_loop():
                 v, u = (places[node] - PATCH // 2).tolist()
                 canvas[v : v + PATCH, u : u + PATCH] = patches[node, chosen].view(PATCH, PATCH)
             assert float(cost[x, y]) == pytest.approx(np.nansum((first - second) ** 2))
-
-
-def test_distinct_pairs_are_kept_once_and_found_again():
-    pairs = torch.stack((_patches(6), _patches(6, seed=1)), dim=1)
-    assert len(deduplicate(torch.cat((pairs, pairs)))) == 6
-    assert len(deduplicate(orient(pairs))) == 48
-    far, which = find_nearest(pairs[:, 1], pairs[:, 1:].expand(-1, 2, -1, -1), 3, 3.0)
-    assert torch.equal(which[:, 0], torch.arange(6))
-    assert float(far[:, 0].max()) < 1e-3
-
-
-def test_thinning_reduces_a_bar_to_a_line_and_keeps_a_line():
-    bar = torch.zeros(20, 30, dtype=torch.bool)
-    bar[8:11, 5:25] = True
-    line = thin(bar)
-    assert int(line.sum(dim=0).max()) == 1
-    assert int(line.any(dim=0).sum()) >= 16
-    assert torch.equal(thin(line), line)
-
-
-def test_edges_lie_at_steps_and_not_on_steep_planes():
-    v, u = grid(16, 20)
-    assert not bool(detect_edges(3 * u - 2 * v, 2, 0.1).any())
-    assert not bool(predict_edge_map(3 * u - 2 * v, 2, 0.1)[0].any())
-    found = detect_edges(torch.where(u < 10, 0.0, 1.0).double(), 2, 0.1)
-    assert bool(found[:, 18:22].any(dim=1).all())
-    assert not bool(found[:, :18].any() | found[:, 22:].any())

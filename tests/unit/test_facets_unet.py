@@ -1,10 +1,13 @@
-"""Facets, with and without context: what holds for any weights, hints, confidence, sharing, and that it can learn."""
+"""Facets, with and without context: what holds for any weights, kernels, sharing, and its parts against plain loops."""
 
 import itertools
 
+import numpy as np
 import pytest
 import torch
-from small_scenes import maps, photos, plane_map
+from numpy.lib.stride_tricks import sliding_window_view
+from small_networks import with_any_weights
+from small_scenes import maps
 from torch import nn
 from torch.nn import functional
 
@@ -16,117 +19,24 @@ from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.trained import NETWORKS
 from dsr.methods.networks.weight_files import load_network, save_network
 
-
-def _facets(scale=4, *, noise=0.1, facets=2):
-    """Return a small network with weights far from those that it starts with."""
-    torch.manual_seed(scale)
-    net = Facets(scale, width=12, blocks=1, facets=facets).requires_grad_(False)
-    for parameter in net.parameters():
-        parameter.add_(noise * torch.randn_like(parameter))
-    return net
-
-
-def test_untrained_mixture_is_the_spline_blend_of_central_difference_planes():
-    """A plain loop over high-resolution pixels, with every output of the network's three heads at 0."""
-    net, coarse = _facets(noise=0), maps(4, 5)
-    for head in (net.planes, net.choice):
-        torch.nn.init.zeros_(head.weight)
-        torch.nn.init.zeros_(head.bias)
-    result = net.upsample(photos(16, 20), coarse)[0, 0]
-    values = coarse[0, 0]
-    first = torch.tensor([0.0, 2.0, 0.0]).softmax(0).double()
-
-    def at(i, j):
-        """Return the map, continued linearly by one pixel."""
-        for axis, k, size in ((0, i, 4), (1, j, 5)):
-            if k in (-1, size):
-                inner, outer = (0, 1) if k == -1 else (size - 1, size - 2)
-                near, far = ((inner, j), (outer, j)) if axis == 0 else ((i, inner), (i, outer))
-                return 2 * at(*near) - at(*far)
-        return float(values[i, j])
-
-    def slope(before, here, after):
-        return float(first @ torch.tensor([here - before, (after - before) / 2, after - here]).double())
-
-    def spline(t, step):
-        return {-1: 0.5 * (0.5 - t) ** 2, 0: 0.75 - t * t, 1: 0.5 * (0.5 + t) ** 2}[step]
-
-    for y, x in ((0, 0), (5, 9), (9, 6), (15, 19), (7, 0)):
-        i, j = y // 4, x // 4
-        ty, tx = (y % 4 + 0.5) / 4 - 0.5, (x % 4 + 0.5) / 4 - 0.5
-        total = weights = 0.0
-        for dy in (-1, 0, 1):
-            for dx in (-1, 0, 1):
-                weight = spline(ty, dy) * spline(tx, dx) + 1e-4
-                inside = (i + dy in range(4), j + dx in range(5))
-                k, m = i + dy * inside[0], j + dx * inside[1]  # a neighbour outside is the pixel itself
-                along_u = slope(at(k, m - 1), at(k, m), at(k, m + 1))
-                along_v = slope(at(k - 1, m), at(k, m), at(k + 1, m))
-                total += weight * (at(k, m) + (tx + j - m) * along_u + (ty + i - k) * along_v)
-                weights += weight
-        assert float(result[y, x]) == pytest.approx(total / weights, rel=1e-6)
-
-
-def test_facets_without_slopes_stay_within_the_surrounding_values():
-    net = Facets(4, width=12, blocks=1, slopes=False)
-    coarse = torch.zeros(1, 1, 6, 6, dtype=torch.float64)
-    coarse[..., 3:] = 1.0
-    with torch.no_grad():
-        for parameter in (net.planes.weight, net.planes.bias):
-            parameter.zero_()
-        hr = net.upsample(photos(24, 24), coarse)
-    assert 0 <= float(hr.min()) < 1e-12
-    assert 1 - 1e-12 < float(hr.max()) <= 1 + 1e-12
-
-
-def test_bend_is_zero_on_planes_and_the_step_beside_an_edge():
-    assert float(stencil(plane_map(8, 9)).bend.max()) < 1e-12
-    step = torch.zeros(1, 1, 9, 12)
-    step[..., 6:] = 2.0
-    bend = stencil(step).bend[0, 0, 4]
-    assert bend.tolist() == [0, 0, 0, 0, 2, 2, 2, 2, 0, 0, 0, 0]
-
-
-def test_gradients_of_facets_agree_with_finite_differences():
-    net = _facets(2, facets=1).double().requires_grad_()
-    rgb, coarse = photos(8, 6).double(), maps(4, 3)
-
-    def loss(value):
-        return torch.func.functional_call(net, {"choice.bias": value}, (rgb, coarse / 30)).square().mean()
-
-    assert torch.autograd.gradcheck(loss, net.choice.bias.detach().clone().requires_grad_())
-
-
-@pytest.mark.slow
-def test_training_learns_an_edge_that_the_photo_shows():
-    """A wall behind a wall: after a few steps on one patch the edge is several times sharper than a spline's."""
-    torch.manual_seed(0)
-    hr = torch.full((1, 1, 32, 32), 20.0)
-    hr[..., 13:] = 26.0
-    rgb = (hr / 40).expand(1, 3, 32, 32)
-    coarse, net = functional.avg_pool2d(hr, 4), Facets(4, width=16, blocks=1)
-    optimiser = torch.optim.Adam(net.parameters(), 3e-3)
-    errors = []
-    for _ in range(80):
-        loss = (net.upsample(rgb, coarse) - hr).abs().mean()
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        errors.append(float(loss.detach()))
-    assert errors[-1] < 0.2 * errors[0]
-
-
 SCALES = (1, 2, 4, 8, 16)
+
+
+def test_differences_are_those_of_a_map_that_goes_on_linearly():
+    values = maps(4, 5)
+    found, padded = stencil(values), np.pad(values[0, 0].numpy(), 1, mode="reflect", reflect_type="odd")
+    for axis, slopes in ((1, found.slopes[0, 0]), (0, found.slopes[0, 1])):
+        rows = np.moveaxis(padded, axis, 0)[:, 1:-1]
+        expected = rows[1:-1] - rows[:-2], (rows[2:] - rows[:-2]) / 2, rows[2:] - rows[1:-1]
+        np.testing.assert_allclose(slopes, np.moveaxis(np.stack(expected), 1, 1 + axis), atol=1e-12)
+    np.testing.assert_allclose(found.mean[0, 0], sliding_window_view(padded, (3, 3)).mean((2, 3)), rtol=1e-12)
+    step = torch.where(torch.arange(12) >= 6, 2.0, 0.0).expand(1, 1, 9, 12)
+    assert stencil(step).bend[0, 0, 4].tolist() == [0, 0, 0, 0, 2, 2, 2, 2, 0, 0, 0, 0]
 
 
 def _net(scale=4, width=8, deep=12):
     """Return a small network with random weights, also in the layers that begin small."""
-    torch.manual_seed(3)
-    net = FacetsUNet(scale, width, deep, 4).eval()
-    with torch.no_grad():
-        for parameter in net.parameters():
-            parameter.add_(0.05 * torch.randn_like(parameter))
-    return net
+    return with_any_weights(lambda: FacetsUNet(scale, width, deep, 4).eval(), 0.05, 3).requires_grad_()
 
 
 def _maps(answer):
@@ -176,20 +86,6 @@ def test_bands_change_nothing(scale, monkeypatch):
     for one, other in zip(_maps(whole), _maps(banded), strict=True):
         torch.testing.assert_close(other, one, rtol=1e-4, atol=1e-7)
     assert steps == [(number, 5) for number in range(1, 6)]
-
-
-def test_hints_and_noise_change_the_result():
-    rgb, values = _inputs(4)
-    net = _net()
-    nothing = net.answer(rgb, values).disparity
-    facts = torch.zeros(1, FACTS)
-    assert torch.equal(net.answer(rgb, values, torch.full_like(values, 0.01), facts).disparity, nothing)  # not given
-    facts[0, 0] = 1
-    reported = net.answer(rgb, values, None, facts).disparity
-    assert not torch.allclose(reported, nothing, rtol=1e-6, atol=0)
-    facts[0, -1] = 1
-    little, much = (net.answer(rgb, values, torch.full_like(values, level), facts).disparity for level in (1e-3, 1e-2))
-    assert not torch.allclose(little, much, rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8, 16])
@@ -323,20 +219,6 @@ def test_two_convolutions_and_the_shuffle_between_them_are_one():
     for each, gradient in zip(inputs, expected_gradients, strict=True):
         torch.testing.assert_close(each.grad, gradient)
         assert each.grad.stride() == each.stride()  # which several devices expect
-
-
-@pytest.mark.parametrize("width", [1, 4])
-def test_mixing_in_single_precision_keeps_planes_and_logits(width):
-    generator = torch.Generator().manual_seed(2)
-    planes = torch.zeros((1, 2, 3, 3, width), dtype=torch.float64)  # all of them are of one
-    planes[:, :, 2] = 0.5
-    planes[:, :, 0] = 7 + 0.5 * torch.arange(3, dtype=torch.float64)[:, None]
-    found = torch.randn((1, 2 * NEIGHBOURS, 6, 2 * width), generator=generator)
-    before = found.clone()
-    mixed, _ = mix_planes(planes, found, 2)
-    expected = 7 + 0.5 * (torch.arange(6, dtype=torch.float64) / 2 - 0.25)[:, None].expand(6, 2 * width)
-    torch.testing.assert_close(mixed[0, 0], expected, rtol=0, atol=1e-14)
-    assert torch.equal(found, before)
 
 
 def test_mixed_planes_are_planes_at_each_pixel_weighted_by_a_softmax():

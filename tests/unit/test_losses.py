@@ -7,11 +7,10 @@ from typing import get_args
 import numpy as np
 import pytest
 import torch
-from scipy import sparse
+from scipy import ndimage, sparse
 from scipy.sparse import linalg
 from small_lpips import random_lpips
 from small_scenes import grid
-from torch.nn import functional
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
@@ -51,29 +50,20 @@ def _with_holes(values, seed, share=0.2):
     return values.masked_fill(holes, torch.nan)
 
 
-def _slow_reduce(x):
+def _blur(x, mode):
+    return ndimage.correlate1d(ndimage.correlate1d(x, TAPS, 0, mode=mode), TAPS, 1, mode=mode)
+
+
+def _reduce(x):
     """Blur and keep every second pixel; beyond the border the edge pixel repeats."""
-    height, width = x.shape
-    coarse = np.zeros((math.ceil(height / 2), math.ceil(width / 2)))
-    for i, j in np.ndindex(*coarse.shape):
-        for p, q in np.ndindex(5, 5):
-            row, column = min(max(2 * i + p - 2, 0), height - 1), min(max(2 * j + q - 2, 0), width - 1)
-            coarse[i, j] += TAPS[p] * TAPS[q] * x[row, column]
-    return coarse
+    return _blur(x, "nearest")[::2, ::2]
 
 
-def _slow_expand(coarse, shape):
+def _expand(coarse, shape):
     """Interpolate: low-resolution pixel (i, j) sits at high-resolution pixel (2 i, 2 j); weights are normalised."""
-    fine = np.zeros(shape)
-    for row, column in np.ndindex(*shape):
-        total = 0.0
-        for i, j in np.ndindex(*coarse.shape):
-            if abs(row - 2 * i) <= 2 and abs(column - 2 * j) <= 2:
-                weight = TAPS[row - 2 * i + 2] * TAPS[column - 2 * j + 2]
-                fine[row, column] += weight * coarse[i, j]
-                total += weight
-        fine[row, column] /= total
-    return fine
+    spread, known = np.zeros(shape), np.zeros(shape)
+    spread[::2, ::2], known[::2, ::2] = coarse, 1
+    return _blur(spread, "constant") / _blur(known, "constant")
 
 
 def _slow_lap1(x, y, levels):
@@ -82,10 +72,10 @@ def _slow_lap1(x, y, levels):
     x, y, weight = np.where(known, x, 0), np.where(known, y, 0), known.astype(float)
     total = 0.0
     for _ in range(levels - 1):
-        coarse_x, coarse_y = _slow_reduce(x), _slow_reduce(y)
-        detail = (x - _slow_expand(coarse_x, x.shape)) - (y - _slow_expand(coarse_y, y.shape))
+        coarse_x, coarse_y = _reduce(x), _reduce(y)
+        detail = (x - _expand(coarse_x, x.shape)) - (y - _expand(coarse_y, y.shape))
         total += (weight * np.abs(detail)).sum() / weight.sum()
-        x, y, weight = coarse_x, coarse_y, _slow_reduce(weight)
+        x, y, weight = coarse_x, coarse_y, _reduce(weight)
     return total + (weight * np.abs(x - y)).sum() / weight.sum()
 
 
@@ -109,24 +99,6 @@ def test_l1_and_mse_are_means_over_valid_pixels(holes):
     difference = (x - y).numpy()
     assert l1(x, y).item() == pytest.approx(np.nanmean(np.abs(difference)), rel=1e-13)
     assert mse(x, y).item() == pytest.approx(np.nanmean(difference**2), rel=1e-13)
-
-
-@pytest.mark.parametrize("c", [-2.5, 0.1, 3.0])
-@pytest.mark.parametrize("size", [(12, 12), (17, 14)])
-def test_constant_offset_gives_its_absolute_value(size, c):
-    x = _map(0, *size)
-    assert lap1(x + c, x).item() == pytest.approx(abs(c), rel=1e-13)
-    assert l1(x + c, x).item() == pytest.approx(abs(c), rel=1e-13)
-    assert mse(x + c, x).item() == pytest.approx(c**2, rel=1e-13)
-
-
-@pytest.mark.parametrize("name", LOSSES)
-def test_losses_are_symmetric_zero_at_the_target_and_positive_elsewhere(name):
-    x, y = _with_holes(_map(0), 2), _with_holes(_map(1), 3)
-    loss = LOSSES[name]
-    assert loss(x, y).item() == pytest.approx(loss(y, x).item(), rel=1e-14)
-    assert loss(x, x).item() == 0
-    assert loss(x, y).item() > 0
 
 
 @pytest.mark.parametrize("name", LOSSES)
@@ -185,16 +157,6 @@ def _guess(batch):
     """Return disparities near the true ones, and finite."""
     truth = (batch["bf"] / batch["depth"] - batch["doffs"]).nan_to_num(1.0)
     return truth + 0.05 * _map(7, 12, 14, batch=2)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("holes", [0.0, 0.15])
-@pytest.mark.parametrize("depth_loss", LOSSES)
-def test_gradient_of_the_objective_is_that_of_its_value(depth_loss, holes):
-    batch, objective = _batch(holes=holes), DepthObjective(depth_loss, 0.7)
-    assert torch.autograd.gradcheck(
-        lambda guess: objective(Answer(guess), batch)["loss"], _guess(batch).requires_grad_()
-    )
 
 
 @pytest.mark.parametrize("holes", [0.0, 0.15])
@@ -352,15 +314,6 @@ def _normals(depth):
 def _photo(depth):
     """Return the grey photo of a surface with albedo 1 under ``LIGHT``."""
     return torch.einsum("b,nbhw->nhw", LIGHT, harmonics(_normals(depth)))[:, None].expand(-1, 3, -1, -1)
-
-
-def test_harmonics_are_orthogonal_over_the_sphere():
-    random = np.random.default_rng(0)
-    z, azimuth = random.uniform(-1, 1, 400_000), random.uniform(0, 2 * np.pi, 400_000)
-    side = np.sqrt(1 - z**2)
-    normals = torch.from_numpy(np.stack((side * np.cos(azimuth), side * np.sin(azimuth), z)))[None, :, None]
-    basis = functional.normalize(harmonics(normals)[0, :, 0], dim=1)
-    torch.testing.assert_close(basis @ basis.T, torch.eye(9).double(), rtol=0, atol=0.01)
 
 
 def test_light_is_the_least_squares_solution_over_valid_pixels():

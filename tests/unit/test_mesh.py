@@ -9,7 +9,6 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from dsr.geometry import mesh as mesh_module
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import fuse_maps, project, select_points, simplify, thin, triangulate, vertex_normals
 from dsr.geometry.poses import PosedMap
@@ -137,12 +136,6 @@ def test_three_valid_pixels_of_a_square_make_a_triangle():
         assert face_normals(mesh)[0][0, 2] < 0
 
 
-def test_diagonal_follows_the_smaller_change_of_depth():
-    depth = torch.tensor([[[2.0, 2.03], [2.01, 2.0]]])
-    for values, ends in ((depth, {0, 3}), (depth.flip(-1), {1, 2})):
-        assert all(ends <= set(face) for face in triangulate(values, Camera(2, 2, 5, 5, 0.5, 0.5)).faces.tolist())
-
-
 @pytest.mark.parametrize("stride", [1, 2, 7])
 def test_vertices_are_the_back_projected_pixels_of_every_which_row_and_column(stride):
     depth = wall() + 2e-4 * torch.arange(1200).view(1, 30, 40)
@@ -151,16 +144,6 @@ def test_vertices_are_the_back_projected_pixels_of_every_which_row_and_column(st
     points = (CAMERA.rays() * depth).flatten(1).T.numpy()
     np.testing.assert_allclose(mesh.vertices, points[mesh.pixels], rtol=1e-6, atol=1e-7)
     assert triangulate(wall(torch.nan), CAMERA, stride=stride).faces.shape == (0, 3)
-
-
-def test_strips_of_rows_and_triangles_leave_no_seam(monkeypatch):
-    depth = wall() + 0.1 * torch.rand(1, 30, 40, generator=torch.Generator().manual_seed(0))
-    whole = triangulate(depth, CAMERA)
-    normals = vertex_normals(whole)
-    monkeypatch.setattr(mesh_module, "_STRIP", 70)
-    strips = triangulate(depth, CAMERA)
-    np.testing.assert_array_equal(strips.faces, whole.faces)
-    np.testing.assert_allclose(vertex_normals(strips), normals, atol=1e-6)
 
 
 HEIGHT, WIDTH = 150, 210

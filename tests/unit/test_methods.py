@@ -1,9 +1,10 @@
-"""What holds of all classical methods: planes stay planes under any photo, and holes are kept or filled."""
+"""What holds of all methods: constant maps stay so, the problem is left as it is; of classical ones: planes, holes."""
 
 from functools import partial
 
 import pytest
 import torch
+from methods_at_hand import AT_HAND, PEERS, build
 from small_scenes import disparity_of, plane, random_scene, sample_of
 
 from dsr.methods.classical.bilateral import Bilateral, JointBilateral
@@ -44,3 +45,19 @@ def test_holes_are_where_the_nearest_low_resolution_pixel_is_missing_unless_fill
         assert float((fine - flat)[~hole].abs().max()) < 1e-9
     if name in EXACT and fill:
         assert float((fine - flat).abs().max()) < (1e-9 if name in GUIDED else 0.2)
+
+
+@pytest.mark.parametrize("name", [name for name in (*AT_HAND, *PEERS) if name != "eg"])  # which needs edges
+def test_constant_map_stays_constant_in_its_type_and_nothing_else_changes(name, tmp_path):
+    """With a hole in it, at a size that few networks' strides divide; the state of the global generator, too."""
+    method, sample = build(name, tmp_path), sample_of(torch.full((72, 88), 5.0).double(), doffs=1.5)
+    sample.depth_lr[:, 3:5, 4:6] = torch.nan
+    before, state = sample.depth_lr.clone(), torch.get_rng_state()
+    depth = method(sample)
+    assert (depth.shape, depth.dtype) == ((1, 72, 88), torch.float64)
+    assert torch.equal(sample.depth_lr.nan_to_num(), before.nan_to_num())
+    assert torch.equal(torch.get_rng_state(), state)
+    assert bool((depth[depth.isfinite()] > 0).all())
+    if not name.startswith("dip"):  # of two steps
+        tolerance = 0.02 if name in ("srfs", *ORDERS) else 1e-5  # interpolation is of perspective depth
+        torch.testing.assert_close(depth[:, 40:60], sample.depth[:, 40:60], rtol=tolerance, atol=0)

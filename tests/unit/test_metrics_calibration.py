@@ -59,14 +59,6 @@ def test_ratios_and_share_are_those_of_numpy_over_pixels_that_have_both_errors()
     assert float(squared_error_share(*given, kept=0.6)) == pytest.approx(kept)
 
 
-def test_share_of_uniform_errors_is_the_cube_when_they_are_known_and_the_fraction_when_they_are_not():
-    random = np.random.default_rng(3)
-    measured, unrelated = (torch.from_numpy(random.uniform(0, 1, 200_000)) for _ in range(2))
-    assert float(squared_error_share(measured, measured)) == pytest.approx(0.8**3, abs=0.005)
-    assert float(squared_error_share(unrelated, measured)) == pytest.approx(0.8, abs=0.005)
-    assert float(squared_error_share(measured, measured, kept=1)) == 1
-
-
 def test_parts_without_pixels_and_errors_of_zero_have_no_value():
     found = error_ratios(torch.tensor([1.0, 2.0, math.nan]), torch.tensor([3.0, 4.0, 5.0]), parts=3)
     np.testing.assert_allclose(found.numpy(), [3, 2, math.nan])
@@ -107,13 +99,6 @@ GIVEN = torch.from_numpy(STATED), torch.from_numpy(ERRORS)
 def test_sparsification_error_is_that_of_mono_uncertainty(steps, expected):
     # abs_rel of compute_aucs in evaluate.py of mattpoggi/mono-uncertainty (543772b), a truth of 1, `intervals` as here
     assert float(ause(*GIVEN, steps)) * ERRORS.mean() == pytest.approx(expected, rel=1e-12)
-
-
-def test_area_of_a_constant_before_uniform_errors_is_a_fourth_and_of_the_truth_itself_nothing():
-    # the mean of the least (1 - x) of them is half of 1 - x: the curves are 1 and 1 - x, relative to the mean 1 / 2
-    measured = torch.linspace(0, 1, 100_001, dtype=torch.float64)
-    assert float(ause(torch.ones_like(measured), measured)) == pytest.approx(0.5 - 1 / 200, rel=1e-4)
-    assert float(ause(3 * measured, measured)) == 0
 
 
 def test_normalised_calibration_error_of_gaussian_and_laplace_errors_is_known():

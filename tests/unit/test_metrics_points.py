@@ -1,4 +1,4 @@
-"""Flying pixels, Chamfer distance and F-score, against all pairs of points, and closed forms."""
+"""Flying pixels, Chamfer distance and F-score, against all pairs of points."""
 
 import math
 
@@ -70,16 +70,6 @@ def test_scores_are_those_of_all_pairs_of_points(seed):
     assert found == pytest.approx(_naive(prediction, truth), rel=1e-10)
     assert 0 < found["Points_flying"] < 0.3
     assert 0.1 < found["Points_F_1cm"] < found["Points_F_5cm"] < 1
-
-
-@pytest.mark.parametrize("gap", [0.003, 0.02, 0.2])
-def test_parallel_planes_are_as_far_apart_as_their_gap(gap):
-    """The nearest point of the other plane is straight across, up to the spacing of the pixels, 1 / 60 of the depth."""
-    found = _scores(np.full_like(U, 1 + gap), np.ones_like(U))
-    assert gap <= found["Points_chamfer"] < math.hypot(gap, 0.3 * gap) + 0.012
-    if gap > 0.01:
-        assert found["Points_F_1cm"] == 0
-    assert found["Points_flying"] == 0  # there is no edge
 
 
 def test_only_points_in_the_void_between_surfaces_fly():

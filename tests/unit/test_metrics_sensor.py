@@ -100,13 +100,6 @@ def test_prediction_that_is_nowhere_near_covers_nothing():
     assert math.isnan(_rows(prediction, np.full_like(truth, np.nan))["Sensor_covered", ""].value)
 
 
-@pytest.mark.parametrize("steps", [0, 1, 3])
-def test_erosion_is_scipys(steps):
-    mask = np.random.default_rng(0).random((2, 1, 17, 23)) < 0.9
-    expected = np.stack([ndimage.binary_erosion(each[0], iterations=steps) if steps else each[0] for each in mask])
-    np.testing.assert_array_equal(sensor.erode(torch.from_numpy(mask), steps)[:, 0].numpy(), expected)
-
-
 BOARD_CAMERA = Camera(width=64, height=48, fx=60.0, fy=62.0, cx=31.0, cy=24.5)
 V, U = np.mgrid[:48, :64].astype(float)
 X, Y = (U - 31) / 60, (V - 24.5) / 62

@@ -51,13 +51,6 @@ def test_flicker_is_numpys_deviation_over_the_median_of_each_pixel():
     assert temporal_noise(_maps(depths), given).item() == pytest.approx(np.median(ratio[static]), rel=1e-12)
 
 
-def test_flicker_of_two_states_is_half_their_distance():
-    states = np.where(TIME[:, :1, :1] % 2 == 0, 1.98, 2.02)
-    assert flicker(_maps(states)).item() == pytest.approx(0.01)
-    assert temporal_noise(_maps(states)).item() == pytest.approx(0.01)
-    assert flicker(_maps(np.tile(STILL, (3, 1, 1)))).item() == pytest.approx(0, abs=1e-12)
-
-
 def test_holes_are_left_out_and_counted():
     depths = _noisy(1)
     depths[2, :5], depths[3:, 5:7], depths[1:, 7] = np.nan, 0, -1

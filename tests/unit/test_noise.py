@@ -1,12 +1,10 @@
 """Noise, against its laws: exact numbers where the draws are known, statistics of large maps where they are not.
 
-The noise of cameras drawn at random has the stated amplitudes, lengths, steps, bands and edges.
+The noise of cameras drawn at random has the stated amplitudes, lengths and bands.
 """
 
 import math
 
-import cv2
-import numpy as np
 import pytest
 import torch
 from small_scenes import seeded
@@ -14,7 +12,7 @@ from small_scenes import seeded
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.noise import NOISES, GaussianMultiplicative, Kinect, TimeOfFlight
 from dsr.degradation.random_fields import field_of, waves_of
-from dsr.geometry.camera import RANGE_TYPES, Camera, from_range, to_range
+from dsr.geometry.camera import RANGE_TYPES, Camera
 from dsr.sample import Scene
 
 CAMERA = Camera(8, 4, 10.0, 10.0, 3.5, 1.5, baseline=0.1, doffs=0.5)
@@ -36,40 +34,12 @@ def _scene(depth=STEPS, measured=None):
 # What all kinds have in common
 
 
-@pytest.mark.parametrize("noise", KINDS)
-def test_noise_is_a_function_of_its_generator_keeps_holes_and_is_the_same_in_float32(noise):
-    depth = 1 + torch.rand(2, 1, 30, 40, generator=seeded(3))
-    depth[1, 0, 2, 3] = torch.nan
-    single, again, other = (noise(depth, seeded(seed)) for seed in (1, 1, 2))
-    assert (single.shape, single.dtype) == (depth.shape, torch.float32)
-    assert torch.equal(single.nan_to_num(), again.nan_to_num())
-    assert not torch.equal(single.nan_to_num(), other.nan_to_num())
-    double = noise(depth.double(), seeded(1))
-    torch.testing.assert_close(single.double(), double, rtol=1e-6, atol=0, equal_nan=True)
-    if not isinstance(noise, Kinect):  # whose pixels may be lost
-        assert torch.equal(double.isnan(), depth.isnan())
-
-
 @pytest.mark.parametrize("method", RANGE_TYPES)
 @pytest.mark.parametrize("noise", SENSORS)
 def test_sensor_noise_applies_to_metric_depth_whatever_is_averaged(noise, method):
     clean = make_sample(_scene(), 2, BOX, method).depth_lr
     noisy = make_sample(_scene(), 2, BOX, method, noise, seeded(5)).depth_lr
     torch.testing.assert_close(noisy, noise(clean, seeded(5)), rtol=1e-12, atol=0, equal_nan=True)
-
-
-@pytest.mark.parametrize("method", RANGE_TYPES)
-def test_noise_gets_its_declared_range_type(method):
-    class Offset:
-        range_type = "perspective"
-
-        def __call__(self, values, generator):
-            return values + 1
-
-    clean, noisy = (make_sample(_scene(), 2, BOX, method, noise) for noise in (None, Offset()))
-    camera = clean.camera_lr
-    expected = from_range(to_range(clean.depth_lr, camera, "perspective") + 1, camera, "perspective")
-    torch.testing.assert_close(noisy.depth_lr, expected, rtol=1e-13, atol=0)
 
 
 @pytest.mark.parametrize("noise", KINDS)
@@ -82,15 +52,6 @@ def test_refused_or_measured_sample_draws_nothing(noise):
         with pytest.raises(ValueError, match="expected"):
             make_sample(scene, scale, BOX, "disparity", noise, generator)
     assert torch.equal(generator.get_state(), before)
-
-
-def test_sensor_draws_the_same_numbers_for_all_settings():
-    states = []
-    for noise in (Kinect(), Kinect(**QUIET, nearest=None, farthest=None), Kinect(reach=3, dropout=1.0)):
-        generator = seeded(2)
-        noise(STEPS, generator)
-        states.append(generator.get_state())
-    assert all(torch.equal(state, states[0]) for state in states)
 
 
 # Time of flight
@@ -111,20 +72,6 @@ def test_non_positive_disparity_of_time_of_flight_is_a_hole():
     assert torch.equal(noisy.isnan(), v + 651 / v * draws <= 0)
     assert bool((noisy[noisy.isfinite()] > 0).all())
     assert bool(TimeOfFlight(doffs=200.0)(_wall(3.0, 10), seeded()).isnan().all())
-
-
-@pytest.mark.parametrize(("name", "scale"), [("art_depth_2_n.png", 4), ("art_depth_3_n.png", 8)])
-def test_noisy_middlebury_inputs_have_five_levels_of_noise_at_every_disparity(shared, name, scale):
-    folder = shared / "real" / "middlebury2005"
-    fine, noisy = (cv2.imread(str(folder / each), cv2.IMREAD_UNCHANGED).astype(float) for each in ("art_big.png", name))
-    height, width = noisy.shape
-    blocks = fine.reshape(height, scale, width, scale).transpose(0, 2, 1, 3).reshape(height, width, -1)
-    calm = cv2.erode(((blocks.max(-1) - blocks.min(-1)) <= 2).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    levels, errors = blocks.mean(-1)[calm], (noisy - blocks.mean(-1))[calm]
-    far, near = errors[levels < 100], errors[levels > 170]
-    assert min(far.size, near.size) > 3000
-    assert far.std() == pytest.approx(5, rel=0.02)  # 651 / v: 8 and 3.5; its root: 2.8 and 1.9
-    assert near.std() == pytest.approx(5, rel=0.02)
 
 
 # Structured light
@@ -209,7 +156,7 @@ def test_readings_out_of_range_are_holes_unless_the_limits_are_off():
 # Cameras drawn at random
 
 
-def _slanted(depth, size=256):
+def _slanted(depth, size=128):
     """Return inverse depth of a wall that turns away by 10 %."""
     return torch.linspace(1, 1.1, size).repeat(1, size, 1) / depth
 
@@ -243,18 +190,18 @@ def _full_width(field):
     return math.inf
 
 
-@pytest.mark.parametrize("length", [1, 3, 8, 20, 40])
+@pytest.mark.parametrize("length", [1, 3, 20])
 def test_waves_are_as_long_as_asked(length):
-    waves = torch.cat([waves_of(torch.empty(1, 256, 256), length, seeded(seed)) for seed in range(12)])
+    waves = torch.cat([waves_of(torch.empty(1, 200, 200), length, seeded(seed)) for seed in range(10)])
     assert float(waves.std()) == pytest.approx(1, rel=0.1)
     assert _full_width(waves) == pytest.approx(length, rel=0.2)
-    stretched = torch.cat([waves_of(torch.empty(1, 256, 256), 8, seeded(seed), 1.5) for seed in range(4)])
+    stretched = torch.cat([waves_of(torch.empty(1, 128, 128), 8, seeded(seed), 1.5) for seed in range(4)])
     columns, rows = (float((each[0] * each[1]).mean()) for each in (
         (stretched[:, 4:], stretched[:, :-4]), (stretched[..., 4:], stretched[..., :-4])))  # fmt: skip
     assert rows > columns + 0.2
 
 
-@pytest.mark.parametrize("sigma", [1.0, 4.0, 12.0])
+@pytest.mark.parametrize("sigma", [1.0, 8.0])
 def test_fields_are_alike_as_far_as_a_gaussian_makes_them(sigma):
     field = torch.cat([field_of(torch.empty(1, 250, 250), sigma, seeded(seed)) for seed in range(12)])
     lag = round(sigma)
@@ -265,76 +212,20 @@ def test_fields_are_alike_as_far_as_a_gaussian_makes_them(sigma):
 
 def test_stereo_loses_a_band_on_one_side():
     values = _square()
-    lost = sum(NOISES["stereo"](values, _photo(values), seeded(seed)).isnan() for seed in range(40))
+    lost = sum(NOISES["stereo"](values, _photo(values), seeded(seed)).isnan() for seed in range(20))
     left, right = (float(lost[0, 70:130, columns].float().mean()) for columns in (slice(70, 76), slice(124, 130)))
     assert left > 2.5 * right
-    assert left > 8, "of 40"
-
-
-def test_stereo_repeats_values_has_waves_of_all_lengths_and_few_pixels_are_far_off():
-    lengths, repeated = [], 0
-    for error in _errors("stereo", _slanted(1.5, 320), 30):
-        known = error.isfinite()
-        assert float(known.float().mean()) > 0.4
-        assert 2e-4 < float(error[known].std()) < 0.03
-        lengths.append(_full_width(error - error.nanmean()))
-        values = (1 + error) * _slanted(1.5, 320)
-        repeated += float((values[..., 1:] == values[..., :-1]).float().mean()) > 0.3
-    assert min(lengths) < 6
-    assert max(lengths) > 25
-    assert sum(5 < length < 45 for length in lengths) > 15
-    assert 10 < repeated < 28
+    assert left > 4, "of 20"
 
 
 def test_structured_light_is_as_noisy_as_measured_ones():
     """Nguyen et al. 2012: 1.2 mm + 1.9 mm (z - 0.4)^2, times 0.4 to 2.5, and steps of disparity."""
 
     def deviation(depth):
-        errors = torch.stack([error[error.isfinite()].std() for error in _errors("structured", _slanted(depth), 80)])
+        errors = torch.stack([error[error.isfinite()].std() for error in _errors("structured", _slanted(depth), 40)])
         return depth * float(errors.median())
 
     near, middle, far = (deviation(depth) for depth in (0.5, 1, 3))
     assert 0.0006 < middle < 0.006
     assert near / middle > 0.35, "0.65 by the formula; noise of disparity alone would give 0.25"
     assert 4 < far / middle < 11
-
-
-def test_lidar_smears_steps_and_is_biased_by_distance():
-    """A seventh of a jump between neighbours at the softest; bias of up to 3 % near the sensor, less far away."""
-    shares = []
-    for seed in range(30):
-        values = NOISES["lidar"](_square(), _photo(_square()), seeded(seed))
-        row = values[0, 70:130].median(dim=0).values
-        shares.append([float((row[n:100] - row[: 100 - n]).max() / 0.5) for n in (1, 3)])
-    one, three = torch.tensor(shares).T
-    assert float(one.min()) < 0.25
-    assert 0.2 < float(one.median()) < 0.7
-    assert 0.45 < float(three.median()) < 1.05
-    bias = [torch.stack([error.mean().abs() for error in _errors("lidar", _slanted(depth), 30)]) for depth in (0.35, 3)]
-    assert 0.015 < float(bias[0].max()) < 0.035
-    assert 2 < float(bias[0].max() / bias[1].max()) < 8
-
-
-def test_time_of_flight_mixes_depth_on_both_sides_of_steps():
-    sides = torch.zeros(2)
-    for seed in range(30):
-        depth = NOISES["flight"](_square(), _photo(_square()), seeded(seed)).reciprocal()
-        between = ((depth > 1.05) & (depth < 1.95))[0, 70:130]
-        sides += torch.stack((between[:, 76:80].float().mean(), between[:, 80:84].float().mean()))
-    assert bool((sides > 2).all())
-
-
-def test_time_of_flight_sees_dark_surfaces_too_far_and_rounds_inner_corners():
-    depth = 2 - 0.004 * (torch.arange(200.0) - 100).abs().repeat(1, 200, 1)  # the farthest in the middle
-    luma = torch.full(depth.shape, 0.7)
-    luma[:, 100:] = 0.02
-    dark, corner = [], []
-    for seed in range(60):
-        error = NOISES["flight"](depth.reciprocal(), luma, seeded(seed)).reciprocal() - depth
-        profile, bright = error.nanmean(dim=-2)[0], error[:, :100].nanmean(dim=-2)[0]
-        dark.append(float(error[:, 100:].nanmean() - error[:, :100].nanmean()))
-        corner.append(float(bright[98:103].mean() - (bright[60:75].mean() + bright[125:140].mean()) / 2))
-        assert bool(profile.isfinite().any())
-    farther = torch.tensor(dark).nan_to_num(0)
-    assert 10 < int((farther > 1e-3).sum()) < 50
-    assert float(torch.tensor(corner).mean()) < -2e-4

@@ -78,6 +78,7 @@ def test_every_network_is_tested():
     assert {type(build()).__name__ for build, _ in SMALL.values()} == set(NETWORKS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SMALL)
 def test_graph_computes_what_the_network_does_at_any_size(name, exported):
     graph, path = exported(name)

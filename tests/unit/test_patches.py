@@ -215,15 +215,6 @@ def test_training_scene_cannot_validate_under_another_name():
     assert list(other.held_out) == ["set", "mine"]
 
 
-def test_patches_reach_every_row_and_column_of_a_scene():
-    patches = _patches()
-    seen = (set(), set())
-    for i in range(400):
-        for places, reached in zip(_places(patches[i])[:2], seen, strict=True):
-            reached.update(places.flatten().tolist())
-    assert seen == (set(range(44)), set(range(60)))
-
-
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
 def test_patch_has_the_points_of_its_pixels_in_the_scene_up_to_the_mirror(camera):
     bumps = torch.from_numpy(np.random.default_rng(0).uniform(1, 3, (1, 44, 60)))
@@ -277,19 +268,6 @@ def test_min_max_lies_between_the_patchs_and_the_scenes_and_half_are_the_scenes(
     assert between.std() == pytest.approx(12**-0.5, abs=0.05)  # of a uniform distribution
 
 
-def test_min_max_of_a_noisy_patch_contains_its_low_resolution_map_or_is_the_clean_scenes():
-    patches = Patches([[_scene()]], _settings(), Degradation(4, BOX, GaussianMultiplicative(0.005)))
-    coarse = 10 * (1 / _tilted(CAMERA)).reshape(11, 4, 15, 4).mean(dim=(1, 3))
-    clean = 0
-    for i in range(60):
-        patch = patches[i]
-        (low, high), own = patch["min_max"].flatten().tolist(), patch["disparity_lr"]
-        assert low <= float(own.min()) + 1e-5
-        assert high >= float(own.max()) - 1e-5
-        clean += [low, high] == pytest.approx([float(coarse.min()), float(coarse.max())], rel=1e-5)
-    assert clean > 15
-
-
 def test_min_max_of_a_whole_scene_is_its_low_resolution_maps_and_that_of_a_wall_has_width():
     whole = WholeScenes([_scene()], X4)[0]
     assert whole["min_max"].flatten().tolist() == pytest.approx(
@@ -326,20 +304,6 @@ def test_colour_is_a_gain_per_channel_of_the_given_spread():
     assert gains.std(axis=0) == pytest.approx([0.1] * 3, abs=0.02)
     assert gains.mean(axis=0) == pytest.approx([1] * 3, abs=0.03)
     assert np.abs(np.corrcoef(gains.T)[np.triu_indices(3, 1)]).max() < 0.2
-
-
-def test_given_fraction_of_the_photos_gets_another_gamma_blur_and_noise():
-    step = replace(_scene(), rgb=(0.2 + 0.6 * (torch.arange(60.0) >= 30)).expand(3, 44, 60).contiguous())
-    patches = _patches([step], photo=0.5, flip=False)
-    changed = [patch["rgb"] for patch in (patches[i] for i in range(400)) if len(patch["rgb"].unique()) > 2]
-    assert len(changed) / 400 == pytest.approx(0.5, abs=0.08)
-    left = torch.stack([photo[..., :3].mean() for photo in changed if photo[..., :8].max() < 0.55])
-    assert 0.05 < float(left.min()) < 0.12  # 0.2 to the power of exp(0.5)
-    assert 0.3 < float(left.max()) < 0.42  # and of exp(-0.5)
-    noise = torch.stack([photo[..., :3].std() for photo in changed if photo[..., :8].max() < 0.55])
-    assert float(noise.max()) < 0.035
-    assert float(noise.min()) < 0.006
-    assert all(photo.min() >= 0 and photo.max() <= 1 for photo in changed)
 
 
 def test_holes_are_kept_and_half_of_a_patch_is_valid_where_possible():

@@ -1,4 +1,4 @@
-"""Random scenes: exact depth of what the ray tracer says it traces, reproducible from two numbers, varied."""
+"""Random scenes: exact depth of what the ray tracer says it traces, and shapes of the stated sizes."""
 
 import functools
 
@@ -9,7 +9,7 @@ from dsr.synthetic.procedural.materials import PAINTS, picture_paint
 from dsr.synthetic.procedural.photo import Tracer, Viewpoint
 from dsr.synthetic.procedural.random_scene import LAYOUTS, make_camera, random_scene, render, render_random_scene
 from dsr.synthetic.procedural.reliefs import RELIEFS, relief
-from dsr.synthetic.procedural.shape import SOLIDS, box, ellipsoid, extrusion, merge, quad, random_solid, surface
+from dsr.synthetic.procedural.shape import SOLIDS, box, ellipsoid, extrusion, merge, quad, surface
 from dsr.synthetic.raycast import rotation_about
 
 SIZE = 96
@@ -39,35 +39,6 @@ def test_layouts_close_the_view_and_keep_their_ranges(layout):
     assert np.median(picture.depth) < 25
     assert 10 < picture.rgb.mean() < 245
     assert picture.rgb.std() > 4
-
-
-@pytest.mark.slow
-def test_size_changes_only_the_sampling_of_a_scene():
-    scene = random_scene(np.random.default_rng(7))
-    large, small = (render(scene, size) for size in (96, 32))
-    assert large.camera.fx == pytest.approx(3 * small.camera.fx, abs=1e-12)
-    same = np.isclose(large.depth[1::3, 1::3], small.depth, rtol=1e-9)  # rays 1, 4, 7... are those of the small picture
-    assert same.mean() > 0.998
-    close = np.abs(large.rgb.reshape(32, 3, 32, 3, 3).mean((1, 3)) - small.rgb)
-    assert np.median(close) < 8
-
-
-@pytest.mark.slow
-def test_scenes_vary_in_depth_focal_length_and_brightness():
-    ratios = np.array([np.quantile(s.depth, 0.98) / np.quantile(s.depth, 0.02) for s in scenes()])
-    focal = np.array([s.camera.fx / s.camera.width for s in scenes()])
-    middle = np.array([np.median(s.depth) for s in scenes()])
-    light = np.array([s.rgb.mean() for s in scenes()])
-    assert ratios.min() < 1.7
-    assert ratios.max() > 3
-    assert ratios.max() < 7
-    assert focal.min() >= 0.6
-    assert focal.max() <= 1.8
-    assert np.ptp(focal) > 0.7
-    assert middle.max() > 2.5 * middle.min()
-    assert light.std() > 8
-    assert len({s.camera.cx for s in scenes()}) == len(scenes())
-    assert render_random_scene(4, 0, 48).camera.fx != scenes()[0].camera.fx  # the seed counts, too
 
 
 def test_plane_has_the_depth_of_its_closed_form_without_steps():
@@ -140,16 +111,6 @@ def test_solids_are_about_1_in_size_and_stand_on_the_ground(maker):
         assert abs(shape.vertices[:, 2].min()) < 0.16
         np.testing.assert_allclose(np.linalg.norm(shape.normals, axis=1), 1, atol=1e-9)
         assert shape.faces.max() < len(shape.vertices)
-
-
-def test_vertex_normals_agree_with_the_triangles():
-    shape = merge([random_solid(np.random.default_rng(seed)) for seed in range(30, 44)])  # of all kinds
-    corners = shape.vertices[shape.faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(cross, axis=1)
-    keep = area > 1e-8
-    cosine = np.abs((cross[keep, None] / area[keep, None, None] * shape.normals[shape.faces[keep]]).sum(2))
-    assert np.average(cosine.min(1), weights=area[keep]) > 0.99
 
 
 @pytest.mark.parametrize("maker", RELIEFS, ids=lambda maker: maker.__name__)

@@ -89,12 +89,6 @@ def test_holes_are_filled_and_do_not_enter_the_range(folder):
     assert torch.equal(found, method(problem))
 
 
-def test_constant_map_stays_constant(folder):
-    problem = sample_of(torch.full((32, 48), 7.0, dtype=torch.float64), torch.rand(3, 32, 48))
-    depth = PromptDA(str(folder), 56)(problem)
-    torch.testing.assert_close(depth, problem.depth, rtol=1e-5, atol=0)
-
-
 def test_recipe_takes_a_folder_and_knows_its_content(folder):
     method = read_recipe("prompt_da", {"weights": str(folder), "size": 56}).build(4)
     assert isinstance(method, PromptDA)

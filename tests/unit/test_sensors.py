@@ -149,7 +149,13 @@ def test_values_of_time_of_flight_give_none(shared, file):
     assert recognise_values(torch.from_numpy(stored.astype(np.float32))[None] / 1000) is None
 
 
-QUARTER = (slice(None), slice(240), slice(320))  # of a map of 640 x 480 pixels
+PART = (slice(None), slice(144), slice(192))  # of a map of 640 x 480 pixels
+LENS = Camera.centred(192, 144, 360.0)
+GREY = torch.full((3, 144, 192), 0.5)
+
+
+def surface_of(depth, **settings):
+    return upsample_surface(GREY, depth, LENS, **settings)
 
 
 def counted(constant, unit=1e-4, noise=0.0):
@@ -160,6 +166,7 @@ def counted(constant, unit=1e-4, noise=0.0):
     return as_stored(constant / np.round(inverse * constant), unit)
 
 
+@pytest.mark.slow
 def test_sensor_is_identified_by_what_is_given_then_by_values_then_by_files():
     stereo = counted(1024)
     assert identify(stereo)[:2] == (BY_NAME["RealSense D435"], "values")
@@ -190,18 +197,15 @@ def test_sensor_that_is_unknown_or_contradicts_the_values_is_refused():
 def test_computed_disparity_is_no_camera():
     assert find_sensor(counted(1024)) is None
     assert find_sensor(counted(1024, noise=0.004)).sensor is BY_NAME["RealSense D435"]
-    camera, rgb = Camera.centred(320, 240, 600.0), torch.full((3, 240, 320), 0.5)
-    depth = counted(1024)[QUARTER]
-    auto, none = (upsample_surface(rgb, depth, camera, sensor=name) for name in ("auto", "none"))
+    depth = counted(1024)[PART]
+    auto, none = (surface_of(depth, sensor=name) for name in ("auto", "none"))
     assert torch.equal(auto.depth, none.depth)
     assert torch.equal(auto.depth_error, none.depth_error)
 
 
 def test_stated_error_is_never_less_than_the_disparity_allows():
-    camera, rgb, depth = Camera.centred(320, 240, 600.0), torch.full((3, 240, 320), 0.5), counted(512)[QUARTER]
-    none, named = (
-        upsample_surface(rgb, depth, camera, method="bicubic", scale=4, sensor=name) for name in ("none", "D435")
-    )
+    depth = counted(512)[PART]
+    none, named = (surface_of(depth, method="bicubic", scale=4, sensor=name) for name in ("none", "D435"))
     least = 0.45 * math.sqrt(2 / math.pi) * least_error(BY_NAME["RealSense D435"], named.depth) / 0.5
     assert torch.equal(none.depth, named.depth)
     torch.testing.assert_close(named.depth_error, torch.maximum(none.depth_error, least), rtol=5e-3, atol=1e-7)
@@ -221,28 +225,27 @@ def test_systematic_error_of_a_known_sensor_is_added_to_the_stated_one():
     assert torch.equal(found["none"].angle_error, found["Azure Kinect"].angle_error)
 
 
+@pytest.mark.slow
 def test_correlated_noise_of_a_stereo_camera_is_given_as_it_grows():
-    depth = counted(1024, 1e-3, noise=0.004)[QUARTER]
-    camera, rgb = Camera.centred(320, 240, 600.0), torch.full((3, 240, 320), 0.5)
+    depth = counted(1024, 1e-3, noise=0.004)[PART]
     found = find_noise(depth)
     assert found.extent == pytest.approx(9, rel=0.2)
     assert found.deviation == pytest.approx(0.004 * found.distance**2, rel=0.2)
     reported = {"noise": found.deviation / found.distance**2, "noise_growth": 2.0}
     sensed, set_here, unset = (
-        upsample_surface(rgb, depth, camera, sensor=sensor, settings=settings).depth
+        surface_of(depth, sensor=sensor, settings=settings).depth
         for sensor, settings in (("D435", {}), ("none", reported), ("none", {}))
     )
     torch.testing.assert_close(sensed, set_here)
     assert not torch.equal(sensed, unset)
-    exact = upsample_surface(rgb, depth, camera, sensor="D435", settings={"noise": 0.0}).depth
-    assert torch.equal(exact, upsample_surface(rgb, depth, camera, sensor="none", settings={"noise": 0.0}).depth)
+    exact = surface_of(depth, sensor="D435", settings={"noise": 0.0}).depth
+    assert torch.equal(exact, surface_of(depth, sensor="none", settings={"noise": 0.0}).depth)
 
 
 def test_noise_that_is_not_correlated_is_left_to_the_network():
     inverse = slanted(1.0, 6.0) + 0.004 * np.random.default_rng(0).standard_normal((480, 640))
-    depth = as_stored(1 / inverse, 1e-3)[QUARTER]
-    camera, rgb = Camera.centred(320, 240, 600.0), torch.full((3, 240, 320), 0.5)
-    named, none = (upsample_surface(rgb, depth, camera, sensor=name).depth for name in ("D435", "none"))
+    depth = as_stored(1 / inverse, 1e-3)[PART]
+    named, none = (surface_of(depth, sensor=name).depth for name in ("D435", "none"))
     assert torch.equal(named, none)
 
 

@@ -21,7 +21,6 @@ from dsr.methods.classical.shape_from_shading import (
     boundary_length,
     compute_shading,
     compute_surface,
-    conjugate_gradients,
     fit_albedo,
     fit_lighting,
     fuse,
@@ -51,13 +50,6 @@ def _two(size=24, noise=0.03):
     return rgb, shading, disc
 
 
-def test_two_regions_under_noise_are_found_exactly():
-    rgb, shading, disc = _two()
-    regions = fuse(rgb, shading, 0.05, _everywhere(rgb))
-    assert regions.number == 2
-    assert torch.equal(regions.labels[0] == regions.labels[0, 13, 11], disc)
-
-
 def test_albedo_of_a_region_is_the_least_squares_one():
     rgb, shading, disc = _two()
     albedo = fit_albedo(rgb, shading, fuse(rgb, shading, 0.05, _everywhere(rgb)))
@@ -69,18 +61,6 @@ def test_albedo_of_a_region_is_the_least_squares_one():
             torch.testing.assert_close(albedo[0, channel][where], torch.full((int(where.sum()),), expected[0]).double())
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("weight", [0.001, 0.02, 0.5])
-def test_partitions_that_fuse_two_regions_have_no_less_energy(seed, weight):
-    rng = np.random.default_rng(seed)
-    rgb, shading = (torch.from_numpy(rng.uniform(0.2, 1, (1, 2, 4, 5))) for _ in range(2))
-    regions = fuse(rgb, shading, weight, _everywhere(rgb))
-    least = _energy(rgb, shading, regions, weight)
-    for one, other in itertools.combinations(range(regions.number), 2):
-        labels = torch.where(regions.labels == other, one, regions.labels)
-        assert _energy(rgb, shading, Regions(labels, regions.number), weight) >= least - 1e-12
-
-
 def test_row_of_pixels_is_cut_as_by_an_exhaustive_search():
     values = torch.tensor([0.2, 0.22, 0.21, 0.6, 0.62, 0.9, 0.88, 0.91]).double()
     rgb = values.reshape(1, 1, 1, 8)
@@ -90,15 +70,6 @@ def test_row_of_pixels_is_cut_as_by_an_exhaustive_search():
         key=lambda labels: _energy(rgb, shading, Regions(labels.reshape(1, 1, 8), 8), 0.02),
     )
     assert torch.equal(fuse(rgb, shading, 0.02, _everywhere(rgb)).labels.reshape(-1), best)
-
-
-def test_regions_of_a_batch_are_those_of_its_pictures():
-    rgb, shading, _ = _two()
-    rgb, shading = torch.cat((rgb, rgb.flip(-1))), torch.cat((shading, shading.flip(-1)))
-    together = fit_albedo(rgb, shading, fuse(rgb, shading, 0.05, _everywhere(rgb)))
-    for number in range(2):
-        one = rgb[number : number + 1], shading[number : number + 1]
-        torch.testing.assert_close(together[number], fit_albedo(*one, fuse(*one, 0.05, _everywhere(one[0])))[0])
 
 
 def test_pixels_outside_stay_alone_and_separate_the_inside():
@@ -195,13 +166,6 @@ def test_normals_of_a_shaded_surface_are_better_than_those_of_bicubic(build, are
     assert _angle(ShapeFromShading(iterations=15, area_weight=area_weight)(sample)[0], truth) < share * bicubic
 
 
-@pytest.mark.parametrize("mask", [False, True])
-def test_slopes_and_their_adjoint_have_transposed_matrices(mask):
-    slopes = _solver(mask=mask).slopes
-    back = _dense(slopes.adjoint, (3, 16, 16))
-    np.testing.assert_allclose(back, _dense(slopes, (1, 16, 16)).T, atol=1e-14)
-
-
 @pytest.mark.parametrize(("holes", "mask"), [(False, False), (True, False), (False, True)])
 def test_depth_step_is_the_least_squares_solution(holes, mask):
     """Of sqrt(data) (K z - coarse) and sqrt(penalty) (G z - theta + u), as dense matrices by numpy."""
@@ -220,28 +184,6 @@ def test_depth_step_is_the_least_squares_solution(holes, mask):
     expected[free] = np.linalg.lstsq(matrix[:, free], right - matrix[:, ~free] @ before[~free], rcond=None)[0]
     solver.update_depth()
     np.testing.assert_allclose(solver.z.flatten().numpy(), expected, rtol=0, atol=1e-4 * expected.std())
-
-
-@pytest.mark.parametrize(("holes", "mask"), [(False, False), (True, False), (False, True)])
-def test_augmented_lagrangian_is_raised_by_no_step_in_its_own_variable(holes, mask):
-    solver = _solver(holes=holes, mask=mask)
-    steps = (solver.update_albedo, solver.update_lighting, solver.update_theta, solver.update_depth)
-    lowered = dict.fromkeys(steps, 0.0)
-    for turn in range(6):
-        for step in steps:
-            before = _lagrangian(solver)
-            step(**({"anew": turn % 2 == 0} if step == solver.update_albedo else {}))
-            after = _lagrangian(solver)
-            assert after <= before + 1e-9 * abs(before), (turn, step)
-            lowered[step] += before - after
-        solver.update_missed(1.3)
-    assert min(lowered.values()) > 0
-
-
-def _lagrangian(solver):
-    miss = solver.slopes(solver.z) + solver.missed - solver.theta
-    bound = 0.5 * solver.penalty * float((solver.coupling * (miss.square() - solver.missed.square())).sum())
-    return sum(solver.terms(solver.theta).values()) + bound
 
 
 @pytest.mark.parametrize("mask", [False, True])
@@ -371,13 +313,3 @@ def test_light_on_a_flat_wall_is_the_smallest_that_explains_it():
     albedo = torch.ones(1, 1, 4, 5).double()
     light = fit_lighting(0.6 * albedo, albedo, normals, torch.ones_like(albedo))
     torch.testing.assert_close(light, torch.tensor([[[0.0, 0.0, -0.3, 0.3]]]).double())
-
-
-def test_conjugate_gradients_solve_each_element_of_a_batch_and_leave_a_solved_one_unchanged():
-    rng = np.random.default_rng(0)
-    root = torch.from_numpy(rng.normal(size=(3, 12, 12)))
-    matrices, right = root @ root.mT + torch.eye(12).double(), torch.from_numpy(rng.normal(size=(3, 12)))
-    right[0] = 0
-    found = conjugate_gradients(lambda x: (matrices @ x[..., None])[..., 0], right, 100, 1e-12)
-    torch.testing.assert_close(found[1:], torch.linalg.solve(matrices[1:], right[1:]))
-    assert torch.equal(found[0], torch.zeros(12).double())

@@ -10,11 +10,7 @@ from small_scenes import disparity_of, plane, random_scene, sample_of, step
 from dsr.geometry.camera import to_range
 from dsr.methods.classical.tgv import (
     TotalGeneralisedVariation,
-    divergence,
-    gradient,
-    sum_adjacent,
 )
-from dsr.methods.images import extend_linearly, upsample_linear_border
 
 
 def _normals(*shape, seed=0):
@@ -24,28 +20,6 @@ def _normals(*shape, seed=0):
 def _means(x, scale):
     height, width = x.shape
     return x.numpy().reshape(height // scale, scale, width // scale, scale).mean(axis=(1, 3))
-
-
-@pytest.mark.parametrize("shape", [(1, 1, 5, 7), (2, 2, 4, 3), (1, 1, 1, 6), (1, 2, 3, 1)])
-def test_divergence_is_minus_the_adjoint_of_the_gradient(shape):
-    batch, channels, height, width = shape
-    x, p = _normals(*shape), _normals(batch, 2, channels, height, width, seed=1)
-    assert float((gradient(x) * p).sum()) == pytest.approx(-float((x * divergence(p)).sum()), rel=1e-12)
-
-
-def test_preconditioner_is_the_absolute_column_sum_of_the_gradients():
-    sizes = _normals(1, 2, 1, 4, 5).abs()
-    eye = torch.eye(20).double().reshape(20, 1, 4, 5)
-    expected = (gradient(eye).abs() * sizes).sum(dim=(1, 2, 3, 4)).reshape(4, 5)
-    torch.testing.assert_close(sum_adjacent(sizes)[0, 0], expected)
-
-
-@pytest.mark.parametrize("scale", [2, 4, 8])
-def test_upsampling_and_extending_reproduce_a_plane_up_to_the_border(scale):
-    flat = plane()
-    coarse = torch.from_numpy(_means(flat, scale))[None, None]
-    torch.testing.assert_close(upsample_linear_border(coarse, scale)[0, 0], flat)
-    torch.testing.assert_close(extend_linearly(flat[None, None, 3:-3, 3:-3], 3)[0, 0], flat)
 
 
 def test_tensor_root_has_the_eigenvalues_of_the_paper():
@@ -60,6 +34,7 @@ def test_tensor_root_has_the_eigenvalues_of_the_paper():
     torch.testing.assert_close(torch.linalg.eigvalsh(matrices)[:, 1], torch.ones(42).double())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("data_weight", "holes"), [(None, True), (20.0, False)])
 def test_objective_reaches_that_of_another_algorithm(data_weight, holes):
     """Within 1e-3, on 16 x 16 pixels with depth steps, slopes and noise: ADMM with exact solves."""

@@ -1,17 +1,56 @@
-"""Holes of low-resolution maps: how they are made, their width, and the distance to known pixels."""
+"""What holds of every degradation; holes of low-resolution maps: how they are made, and how wide they are."""
 
 import pytest
 import torch
 from small_scenes import seeded
 
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
+from dsr.degradation.glass import KINDS, add_glass
 from dsr.degradation.holes import Blobs, Shadows
-from dsr.degradation.noise import GaussianMultiplicative
+from dsr.degradation.noise import NOISES, GaussianMultiplicative, Kinect, TimeOfFlight
+from dsr.degradation.random_degradation import Everything
 from dsr.geometry.camera import Camera
 from dsr.geometry.hole_size import distance_to_known, wide_holes
 from dsr.sample import Scene
 
 CAMERA = Camera(width=40, height=30, fx=50.0, fy=50.0, cx=19.5, cy=14.5)
+
+
+WALL = torch.linspace(2, 3, 128).repeat(1, 128, 1).double()
+WALL[:, 32:64, 32:64] = 1.2
+WALL[:, 100:110, 90:100] = torch.nan
+ROOM = Scene("set", "hall", torch.rand(3, 128, 128, generator=seeded()), Camera.from_fov(60, 128, 128), WALL)
+SENSORS = {"gaussian": GaussianMultiplicative(0.02), "flight": TimeOfFlight(), "kinect": Kinect()}
+DEGRADATIONS = {
+    **{name: lambda seed, sensor=sensor: sensor(WALL, seeded(seed)) for name, sensor in SENSORS.items()},
+    **{
+        f"random {kind}": lambda seed, kind=kind: NOISES[kind](1 / WALL.float(), ROOM.rgb[:1], seeded(seed))
+        for kind in NOISES
+    },
+    **{f"seen {kind}": lambda seed, kind=kind: add_glass(ROOM, seeded(seed), {kind: 1})[1] for kind in KINDS},
+    "blobs": lambda seed: WALL.masked_fill(Blobs()(WALL, ROOM.camera, seeded(seed)), torch.nan),
+    **{
+        f"everything x{scale}": lambda seed, scale=scale: Everything()(ROOM, scale, seeded(seed))[0].depth_lr
+        for scale in (1, 2, 4, 8, 16)
+    },
+}
+
+
+@pytest.mark.parametrize("name", DEGRADATIONS)
+def test_degradation_is_a_function_of_its_generator_keeps_holes_and_gives_positive_depth(name):
+    one, again, other = (DEGRADATIONS[name](seed) for seed in (7, 7, 8))
+    torch.testing.assert_close(again, one, rtol=0, atol=0, equal_nan=True)
+    assert not torch.equal(one.nan_to_num(), other.nan_to_num())
+    assert bool((one.nan_to_num(1) > 0).all())
+    if name in (*SENSORS, "blobs", "everything x1"):
+        assert bool(one[WALL.isnan()].isnan().all())
+
+
+@pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
+def test_sensor_has_the_same_noise_in_float32(sensor):
+    single, double = (sensor(depth, seeded(1)) for depth in (WALL.float(), WALL.float().double()))
+    assert (single.dtype, double.dtype) == (torch.float32, torch.float64)
+    torch.testing.assert_close(single.double(), double, rtol=1e-6, atol=0, equal_nan=True)
 
 
 def _edges(mask):
@@ -26,13 +65,6 @@ def test_blobs_have_the_requested_fraction_and_are_connected(share):
     assert int(fine.sum()) == int(coarse.sum()) == round(share * 4800)
     scattered = torch.rand(1, 60, 80) < share
     assert _edges(coarse) < _edges(fine) < 0.6 * _edges(scattered)
-
-
-def test_blobs_depend_on_the_generator_alone():
-    depth = torch.ones(1, 30, 40)
-    masks = [Blobs()(depth * scale, CAMERA, seeded(seed)) for seed, scale in ((1, 1), (1, 2), (2, 1))]
-    assert torch.equal(masks[0], masks[1])
-    assert not torch.equal(masks[0], masks[2])
 
 
 @pytest.mark.parametrize("baseline", [0.2, -0.2])
