@@ -1,4 +1,4 @@
-"""The command behind ``eval.py``: ``python eval.py -m dataset=simgeo,icl method=dip_v``."""
+"""The commands behind ``eval.py`` and ``dsr data prepare``: ``python eval.py -m dataset=simgeo,icl method=dip_v``."""
 
 from __future__ import annotations
 
@@ -19,16 +19,21 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 import torch
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 from dsr.app import run_directory as rundir
+from dsr.app.entry import explain
 from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
+from dsr.app.requests import DataPrepareRequest
 from dsr.app.schema import (
     Config,
     EvalConfig,
     Identity,
     Plan,
+    compose,
     given_keys,
     given_overrides,
     plain_config,
@@ -56,10 +61,10 @@ from dsr.methods.networks.weight_files import files_of_weights
 from dsr.methods.recipe import Known, Recipe, Run
 from dsr.metrics.formats import Formats
 from dsr.report.table_layouts import score_tables
-from dsr.sample import DepthSample
+from dsr.sample import DepthSample, Scene
 from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError
-from dsr.utils.console import ConsoleProgress, note_once, open_console, print_error, show
+from dsr.utils.console import ConsoleProgress, note_once, one_line, open_console, print_error, show
 from dsr.utils.guards import free_memory
 from dsr.utils.processes import Pool, computing_threads, free_first
 from dsr.utils.progress import SILENT, Progress
@@ -129,11 +134,7 @@ def _prepare(
 ) -> tuple[_Prepared, Method, ConsoleProgress]:
     """Check all that an evaluation needs, and write nothing; without a data set, it is that of the configuration."""
     settings = EvalConfig.of(plain)
-    if source is None:
-        if "parts" in settings.dataset:
-            name = settings.names["dataset"]
-            raise ConfigError(f"dataset={name}: several data sets are for training; name one of them")
-        source = as_source(settings.build("dataset"))
+    source = _source(settings) if source is None else source
     scale = _scale(settings, source)
     recipe = Recipe(settings.names["method"], OmegaConf.create(node), user_directories(), plain)
     if "downsampling.assumed" in given_keys() and not recipe.abilities.assumes_downsampling:
@@ -173,6 +174,14 @@ def _prepare(
     _workers(prepared)
     rundir.expect_free(folder, plain, identity, () if here else ("device", "precision"))
     return prepared, method, progress
+
+
+def _source(settings: EvalConfig) -> SceneSource:
+    """Build the data set of the configuration."""
+    if "parts" in settings.dataset:
+        name = settings.names["dataset"]
+        raise ConfigError(f"dataset={name}: several data sets are for training; name one of them")
+    return as_source(settings.build("dataset"))
 
 
 def _scale(settings: EvalConfig, source: SceneSource) -> float:
@@ -382,3 +391,35 @@ def _report(console: Console, run: StoredRun, results: Mapping[str, SceneResult]
         show(console, line)
     for message in filter(None, (result.failure for result in results.values())):
         print_error(message)
+
+
+def prepare_dataset(request: DataPrepareRequest, console: Console) -> list[str]:
+    """Prepare every scene of a data set and draw the contact sheet, ``outputs/data/NAME/sheet.png`` or its pages."""
+    from dsr.pictures.sheets import save_contact_sheet  # noqa: PLC0415 - slow to import
+
+    name, directories = request.name, [] if request.config_dir is None else [request.config_dir]
+    try:
+        settings = EvalConfig.of(plain_config(compose("eval", [f"dataset={name}", *request.settings], directories)))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(explain(error)) from error
+    source = _source(settings)
+    progress, failures = ConsoleProgress(console), list[str]()
+    prepare_scenes(source, source.scenes(), progress)
+
+    def loaded() -> Iterator[Scene]:
+        for scene in progress.track(source.scenes(), "draw"):
+            try:
+                yield source.load(scene)
+            except (ValueError, OSError) as error:
+                failures.append(one_line(error))
+
+    folder = Path("outputs", "data", name)
+    before = set(folder.glob("sheet*.png"))
+    pages = save_contact_sheet(folder / "sheet.png", loaded(), f"{name}, as prepared")
+    for path in before - set(pages):
+        path.unlink()
+    for path in pages:
+        show(console, f"contact sheet: {path}")
+    if failures:
+        raise ConfigError(f"{len(failures)} of {len(source.scenes())} scenes cannot be read: {'; '.join(failures)}")
+    return []

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from dsr.cli.commands import add_commands
-from dsr.data.download.collections import Collection
-from dsr.doctor.about import version_lines
+from dsr.doctor import version_lines
 from dsr.utils import interruption
 from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, printable, show
 from dsr.utils.files import FullDiskError
@@ -37,16 +36,13 @@ In a checkout of the project, `python eval.py` and `python train.py` are the sam
 """
 
 
-def main(arguments: Sequence[str] | None = None, catalogue: Mapping[str, Collection] | None = None) -> int:
-    """Run the command, and return its exit code: 0, 2 after an error, 130 or 143 when interrupted.
-
-    ``catalogue`` has the data sets to offer; None for :func:`dsr.cli.data_tasks.downloads`.
-    """
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command, and return its exit code: 0, 2 after an error, 130 or 143 when interrupted."""
     options = make_parser().parse_args(arguments)
     console = open_console()
     try:
         with refusing_excess():
-            problems = options.run(options, console, catalogue)
+            problems = options.run(options, console)
     except KeyboardInterrupt as interrupted:
         return interruption.stop(str(interrupted))
     except (ValueError, OSError, FullDiskError) as error:

@@ -60,12 +60,12 @@ def _weights(names: list[str]) -> Collection:
     )
 
 
-def list_data_sets(_: DataListRequest, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
+def list_data_sets(_: DataListRequest, console: Console) -> list[str]:
     """Show a table of the data sets."""
     table = Table(box=None, pad_edge=False)
     for header in ("name", "what", "about", "here", "checksums"):
         table.add_column(header, overflow="fold", no_wrap=header != "what")
-    for collection in catalogue.values():
+    for collection in downloads().values():
         size = "" if collection.size is None else megabytes(collection.size)
         here, known = state(collection, data_root()), checksums_of(collection, data_root())
         table.add_row(collection.name, collection.title, size, here, known)
@@ -73,21 +73,21 @@ def list_data_sets(_: DataListRequest, console: Console, catalogue: Mapping[str,
     return []
 
 
-def show_folders(request: DataWhereRequest, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
+def show_folders(request: DataWhereRequest, console: Console) -> list[str]:
     """Show the directory of the data sets, and their folders."""
-    collections = find(request.names, catalogue)
+    collections = find(request.names, downloads())
     if not collections:
         show(console, str(data_root().absolute()))
-    for collection in collections or catalogue.values():
+    for collection in collections or downloads().values():
         for folder in collection.folders:
             path = (data_root() / folder).absolute()
             show(console, str(path) if collections else f"  {collection.name:<17} {path}")
     return []
 
 
-def get_data_sets(request: DataGetRequest, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
+def get_data_sets(request: DataGetRequest, console: Console) -> list[str]:
     """Show what will be downloaded and its licence, ask for confirmation on a terminal, and download it."""
-    collections = find(request.names, catalogue)
+    collections = find(request.names, downloads())
     if request.mirror is not None:
         expect_address(request.mirror)  # before anything is shown
     root, progress = data_root(), ConsoleProgress(console)
@@ -130,10 +130,10 @@ def _agreed(console: Console) -> bool:
     return answer.strip().lower() in ("", "y", "yes")
 
 
-def verify_data_sets(request: DataVerifyRequest, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
+def verify_data_sets(request: DataVerifyRequest, console: Console) -> list[str]:
     """Check collections, and show which are complete."""
     problems, progress = [], ConsoleProgress(console)
-    for collection in find(request.names, catalogue):
+    for collection in find(request.names, downloads()):
         found = verify(collection, data_root(), progress)
         if not found:
             show(console, f"{collection.name}: complete, as recorded")

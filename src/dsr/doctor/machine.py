@@ -18,8 +18,7 @@ from packaging.specifiers import SpecifierSet
 from rich.text import Text
 
 from dsr.data.download.collections import CATALOGUE
-from dsr.doctor.about import graphics_cards, processor, version_lines
-from dsr.doctor.findings import FINE, Finding, Level, show_findings
+from dsr.doctor import Finding, Level, graphics_cards, processor, show_findings, version_lines
 from dsr.methods import weights
 from dsr.synthetic.rendering import cache_directory
 from dsr.utils.compute_device import fast_precision, pick_device
@@ -51,7 +50,7 @@ def examine_machine() -> int:
     missing = [each for each in findings if each.level == "problem"]
     if not missing:
         console.print("everything that dsr upsample needs is here", style="bold", highlight=False)
-        return FINE
+        return 0
     advice = "; ".join(dict.fromkeys(each.advice for each in missing))
     console.print(Text(f"dsr upsample needs: {advice}", "bold red"), soft_wrap=True)
     return USAGE_ERROR
