@@ -19,7 +19,6 @@ from dsr.utils.options import (
     option,
     positive,
     recorded,
-    some_of,
 )
 
 
@@ -59,7 +58,9 @@ class Request(Options):
     output: Path = option(..., "where to", flags="-o --output")
     unit: Literal["m", "mm"] = option("m", "of the depth")
     ratios: tuple[float, ...] = option((), "some", rule=Rule("numbers above 0", lambda x: x > 0, each=True))
-    only: tuple[str, ...] = option(("a", "b"), "parts", parse=_words, rule=some_of(("a", "b")))
+    only: tuple[str, ...] = option(
+        ("a", "b"), "parts", parse=_words, rule=Rule("some of a, b", "ab".__contains__, each=True)
+    )
     extra: tuple[Path, ...] = option((), "more", repeated=True)
     settings: dict[str, str] | None = option(None, "KEY=VALUE", flags="--set", parse=_entries, repeated=True)
     light: str = option("e1", "a light", rule=one_of(("e1", "e2")))

@@ -12,7 +12,7 @@ from dsr.app.upsample.parts import EXPECTED_ERROR
 from dsr.geometry.lights import FIGURE_LIGHT, LIGHT_CHOICES, LIGHT_NAMES
 from dsr.report.study import Choice
 from dsr.utils.configuration import config_directories, list_choices
-from dsr.utils.options import Options, Rule, at_least, group, one_of, option, positive, some_of
+from dsr.utils.options import Options, Rule, at_least, group, one_of, option, positive
 
 SHELLS = ("bash", "zsh", "fish")
 REPORT_PARTS = ("tables", "metrics", "figures", "page")
@@ -57,7 +57,9 @@ class ReportRequest(RunsRequest):
         "these parts alone, of tables, metrics, figures, page",
         "A,B",
         flags="--only",
-        rule=some_of(REPORT_PARTS),
+        rule=Rule(
+            f"some of {', '.join(REPORT_PARTS)}", lambda part: part in REPORT_PARTS, each=True, known=REPORT_PARTS
+        ),
         parse=lambda text: tuple(part.strip() for part in text.split(",")),
     )
     workers: int | None = option(
