@@ -9,7 +9,7 @@ import torch
 from omegaconf import OmegaConf
 
 from dsr.app import run_directory as rundir
-from dsr.app.run_directory import at_work, default_directory, expect_free, identity_of
+from dsr.app.run_directory import at_work, directory_of, expect_free, identity_of
 from dsr.app.schema import compose, plain_config
 from dsr.utils.configuration import ConfigError, config_directories
 
@@ -49,7 +49,7 @@ def composed(kind, *overrides):
 
 def name_of(kind, *overrides):
     plain = composed(kind, *overrides)
-    return default_directory(kind, plain, identity_of(plain, None, CPU), overrides).name
+    return directory_of(kind, plain, identity_of(plain, None, CPU), overrides).name
 
 
 @pytest.mark.parametrize(
@@ -86,17 +86,17 @@ def test_what_a_name_cannot_say_is_distinguished_by_a_hash():
 def test_run_takes_the_directory_of_no_other_run_and_finds_its_own():
     plain, folders = composed("eval"), []
     for weights in ("abc", "abd"):
-        folders.append(default_directory("eval", plain, identity_of(plain, weights, CPU)))
+        folders.append(directory_of("eval", plain, identity_of(plain, weights, CPU)))
         claim(folders[-1], plain, weights)
     assert folders[0].name == "msg_v_x4_simgeo_seed0"
     assert re.fullmatch(r"msg_v_x4_simgeo_seed0-[0-9a-f]{8}", folders[1].name)
     record = json.loads((folders[1] / "versions.json").read_text())
     assert record["hash"].startswith(folders[1].name.rpartition("-")[2])
-    again = [default_directory("eval", plain, identity_of(plain, weights, CPU)) for weights in ("abc", "abd")]
+    again = [directory_of("eval", plain, identity_of(plain, weights, CPU)) for weights in ("abc", "abd")]
     assert again == folders
     (folders[0] / "versions.json").unlink()
     (folders[0] / "thesis.txt").touch()
-    assert default_directory("eval", plain, identity_of(plain, "abc", CPU)).name.startswith(f"{folders[0].name}-")
+    assert directory_of("eval", plain, identity_of(plain, "abc", CPU)).name.startswith(f"{folders[0].name}-")
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,6 @@ from typing import Any, NoReturn
 
 import hydra
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -77,17 +76,18 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
     process = sys.argv
     sys.argv = process if arguments is None else [process[0], *arguments]  # parsed by Hydra
     try:
-        places = str(config_directories()[0])
-        hydra.main(version_base="1.3", config_path=places, config_name=name)(_job(command, process, begun))()
+        place = str(config_directories()[0])
+        hydra.main(version_base="1.3", config_path=place, config_name=name)(_job(command, process, begun))()
     except KeyboardInterrupt as interrupted:
         sys.exit(interruption.stop(str(interrupted)))
     except (HydraException, OmegaConfBaseException) as error:
-        fail(_damaged_file() or explain(error))
-    except (OSError, FullDiskError, ValueError, YAMLError, RecursionError, BrokenExecutor) as error:
-        if begun and isinstance(error, ValueError | RecursionError) and not isinstance(error, ConfigError):
-            raise  # a defect of the command's
-        of_hydra = isinstance(error, ValueError) and not isinstance(error, ConfigError)  # which names no key
-        fail(_damaged_file() or (f"{' '.join(sys.argv[1:])}: {one_line(error)}" if of_hydra else one_line(error)))
+        fail(explain(error))
+    except (ConfigError, OSError, FullDiskError, YAMLError, BrokenExecutor) as error:
+        fail(one_line(error))
+    except ValueError as error:
+        if begun:  # a defect of the command's
+            raise
+        fail(f"{' '.join(sys.argv[1:])}: {one_line(error)}")  # of Hydra's, which names no key
     finally:
         sys.argv = process
 
@@ -124,21 +124,6 @@ def fail(message: str) -> NoReturn:
     """Print one line on stderr and exit with 2."""
     print_error(message)
     sys.exit(USAGE_ERROR)
-
-
-def _damaged_file() -> str:
-    """Return why the user's configuration files cannot be read, one line; empty if they can."""
-    folder = get_args_parser().parse_known_args(sys.argv[1:])[0].config_dir
-    try:
-        own = config_directories([] if folder is None else [Path(folder)])[1:]
-    except ConfigError as error:
-        return str(error)
-    for path in sorted(path for place in own for path in place.glob("*/*.yaml")):
-        try:
-            OmegaConf.load(path)
-        except Exception as error:  # damaged YAML raises many types
-            return f"{path}: expected a readable YAML file, got {type(error).__name__}"
-    return ""
 
 
 def explain(error: Exception) -> str:
@@ -181,7 +166,6 @@ class CheckJobs(Callback):
         plans: list[Plan] = []
         problems: list[str] = []
         owners: dict[Path, Identity] = {}
-        before = HydraConfig.instance().cfg
         for job, whole in composed:
             HydraConfig.instance().set_config(whole)
             own = copy.deepcopy(whole)
@@ -191,12 +175,9 @@ class CheckJobs(Callback):
                 for plan in module_of(str(config_name), own).plan(own):
                     plans.append(plan)
                     if owners.setdefault(plan.folder.resolve(), plan.identity) != plan.identity:
-                        raise ConfigError(
-                            f"output_dir: expected a directory for each job, got {plan.folder} for several"
-                        )
+                        raise ConfigError(f"output_dir: expected one for each job, got {plan.folder} for several")
             except (ConfigError, OSError, OmegaConfBaseException) as error:
                 problems.append(f"{' '.join(job)}: {one_line(error)}")
-        HydraConfig.instance().cfg = before
         if problems:
             print_error(f"{len(problems)} of the jobs cannot be run, so none is begun")
             for problem in problems:

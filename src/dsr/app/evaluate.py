@@ -160,9 +160,7 @@ def _prepare(
     if len(hashes) > 1:
         weights_hash = hashlib.sha256("".join(hashes).encode()).hexdigest()
     identity = rundir.identity_of(plain, weights_hash, device, recipe.targets())
-    folder = Path(
-        settings.output_dir or rundir.default_directory("eval", plain, identity, given_overrides())
-    ).expanduser()
+    folder = rundir.directory_of("eval", plain, identity, given_overrides())
     downsampling, noise, holes = (settings.build(group) for group in ("downsampling", "noise", "holes"))
     degradation = rundir.degradation_of(plain, assumes=recipe.abilities.assumes_downsampling)
     prepared = _Prepared(
@@ -248,6 +246,22 @@ def _study(prepared: _Prepared, method: Method) -> Evaluation:
         name, label = f"{name}_{method.flag}", f"{label} ({method.flag})"
     metrics = chosen_metrics(settings.metrics, prepared.source.regions)
     formats = {metric.name: metric.format for metric in metrics}
+
+    def illustrate(
+        sample: DepthSample,
+        depth: torch.Tensor,
+        errors: tuple[torch.Tensor, torch.Tensor] | None,
+        scores: Mapping[str, float],
+    ) -> None:
+        """Draw the result of a scene, and its expected errors if there are any."""
+        from dsr.pictures.expected_errors import write_confidence  # noqa: PLC0415 - slow to import
+        from dsr.pictures.panels import save_picture  # noqa: PLC0415
+
+        save_picture(folder / "pictures" / f"{sample.scene}.png", sample, depth, scores, label, formats)
+        if errors is not None:
+            path = folder / "confidence" / f"{sample.scene}.png"
+            write_confidence(path, depth, *errors, sample.depth, sample.camera)
+
     return Evaluation(
         folder,
         prepared.source,
@@ -264,7 +278,7 @@ def _study(prepared: _Prepared, method: Method) -> Evaluation:
         holes=prepared.holes,
         alignment=settings.metrics.alignment,
         label=label,
-        illustrate=functools.partial(_illustrate, folder, label, formats),
+        illustrate=illustrate,
     )
 
 
@@ -285,7 +299,7 @@ def _run(prepared: _Prepared, method: Method, progress: ConsoleProgress) -> pd.D
         scores = write_tables(study, results)
         run = read_run(folder)
         save_dashboard(run)
-    _report(open_console(), run, results, {metric.name: metric.format for metric in study.metrics})
+    _report(run, results, {metric.name: metric.format for metric in study.metrics})
     failed = [scene for scene, each in results.items() if each.failure]
     if failed:
         rest = f"; the others are in {folder}" if len(failed) < len(results) else ""
@@ -354,27 +368,9 @@ def _seed(seed: int) -> None:
     torch.manual_seed(seed)
 
 
-def _illustrate(
-    folder: Path,
-    label: str,
-    formats: Formats,
-    sample: DepthSample,
-    depth: torch.Tensor,
-    errors: tuple[torch.Tensor, torch.Tensor] | None,
-    scores: Mapping[str, float],
-) -> None:
-    """Draw the result of a scene, and its expected errors if there are any."""
-    from dsr.pictures.expected_errors import write_confidence  # noqa: PLC0415 - slow to import
-    from dsr.pictures.panels import save_picture  # noqa: PLC0415
-
-    save_picture(folder / "pictures" / f"{sample.scene}.png", sample, depth, scores, label, formats)
-    if errors is not None:
-        path = folder / "confidence" / f"{sample.scene}.png"
-        write_confidence(path, depth, *errors, sample.depth, sample.camera)
-
-
-def _report(console: Console, run: StoredRun, results: Mapping[str, SceneResult], formats: Formats) -> None:
+def _report(run: StoredRun, results: Mapping[str, SceneResult], formats: Formats) -> None:
     """Print the table of scores, notes and failures."""
+    console = open_console()
     if not run.scores.empty:
         for table in score_tables(run, formats):
             console.print(table)
@@ -389,8 +385,9 @@ def _report(console: Console, run: StoredRun, results: Mapping[str, SceneResult]
         lines.append(f"predictions re-used: {reused} (overwrite=true computes them again)")
     for line in (*lines, f"results: {run.folder}"):
         show(console, line)
-    for message in filter(None, (result.failure for result in results.values())):
-        print_error(message)
+    for result in results.values():
+        if result.failure:
+            print_error(result.failure)
 
 
 def prepare_dataset(request: DataPrepareRequest, console: Console) -> list[str]:

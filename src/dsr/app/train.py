@@ -16,13 +16,7 @@ from typing import Any, Literal
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import (
-    Callback,
-    GradientAccumulationScheduler,
-    LearningRateMonitor,
-    ModelCheckpoint,
-    ProgressBar,
-)
+from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins import environments
 from lightning.pytorch.utilities import rank_zero_only
@@ -154,11 +148,8 @@ def _read(config: DictConfig, *, here: bool = True) -> tuple[dict[str, Any], Tra
     plain = plain_config(config)
     if plain.get("resume") is not None:
         folder = Path(plain["resume"]).expanduser()
-        others = [key for key in given_keys() if key not in _RESUMABLE]
-        if others:
-            raise ConfigError(
-                f"resume: continues with the run's own configuration; {', '.join(others)} cannot be changed"
-            )
+        if others := ", ".join(key for key in given_keys() if key not in _RESUMABLE):
+            raise ConfigError(f"resume: continues with the run's own configuration; {others} cannot be changed")
         before = read_config(folder, plain["trust"])
         device = {"device": plain["device"]} if "device" in given_keys() else {}
         plain = {**before, **device, "resume": None, "output_dir": str(folder), "overwrite": False, "trust": None}
@@ -198,9 +189,7 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, process
     check_metrics(settings.metrics)
     module = _module(settings, net, data)
     identity = rundir.identity_of(plain, None, device)
-    folder = Path(
-        settings.output_dir or rundir.default_directory("train", plain, identity, given_overrides())
-    ).expanduser()
+    folder = rundir.directory_of("train", plain, identity, given_overrides())
     progress = ConsoleProgress(Console(quiet=processes.rank > 0))
     best = BestCheckpoint(folder / _LAST.parent, MONITOR)
     callbacks = [
@@ -214,12 +203,10 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, process
     for name, node in settings.logger.items():
         if name in ("wandb", "mlflow"):  # an extra of that name installs the library
             expect_library(f"logger={name}", name, name)
-        for key, value in node.items():
+        for key, value in node.items():  # of which the run's config.yaml keeps each
             if isinstance(value, str) and without_credentials(value) != value:
-                raise ConfigError(
-                    f"logger.{name}.{key}: expected an address without name and password, which the run's config.yaml "
-                    "would keep; the service reads them from the environment"
-                )
+                what = "an address without name and password, which the service reads from the environment"
+                raise ConfigError(f"logger.{name}.{key}: expected {what}")
         with without_chatter():
             loggers.append(build(f"logger.{name}", {"save_dir": str(folder), **node}))
     ours = READ_OF_TRAINER.keys() - {"gradient_clip_val"}  # the limit of gradients is only checked here
@@ -260,9 +247,8 @@ def _network(settings: TrainConfig) -> DisparityNetwork:
             raise ConfigError(f"start.{key}: {given}: {error}") from error
     for scale in settings.degradation.get("scales") or ():
         if not net.serves(settings.scale, int(scale)):
-            raise ConfigError(
-                f"degradation.scales: expected factors that weights for {settings.scale} serve, got {scale}"
-            )
+            expected = f"factors that weights for {settings.scale} serve"
+            raise ConfigError(f"degradation.scales: expected {expected}, got {scale}")
     for pattern in settings.start.frozen:
         found = [value for name, value in net.named_parameters() if fnmatch.fnmatchcase(name, pattern)]
         if not found:
@@ -305,19 +291,11 @@ def _own_callbacks(settings: TrainConfig, module: SuperResolution) -> list[Callb
         each = build(f"callbacks.{name}", node)
         monitor = getattr(each, "monitor", None)
         if monitor is not None and not monitor.startswith("train/") and monitor not in known:
+            expected = f"one of {', '.join(known[: len(scored)])}"
             near = did_you_mean(monitor, known)
-            raise ConfigError(
-                f"callbacks.{name}.monitor: expected one of {', '.join(known[: len(scored)])}, got {monitor}{near}"
-            )
+            raise ConfigError(f"callbacks.{name}.monitor: expected {expected}, got {monitor}{near}")
         if isinstance(each, LearningRateMonitor) and not settings.logger:
             raise ConfigError(f"callbacks.{name}: expected a logger to write to, such as logger=csv, got none")
-        if isinstance(each, ProgressBar | GradientAccumulationScheduler):
-            raise ConfigError(
-                f"callbacks.{name}: expected none that shows progress, which dsr does, or accumulates batches, which "
-                "trainer.accumulate_grad_batches does; leave it out"
-            )
-        if isinstance(each, ModelCheckpoint):  # whose keys would be alike
-            each.__class__ = type(type(each).__name__, (type(each),), {"state_key": f"callbacks.{name}"})
         own.append(each)
     return own
 
