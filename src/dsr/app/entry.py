@@ -32,7 +32,6 @@ from yaml import YAMLError
 from dsr.app.schema import (
     EvalConfig,
     Identity,
-    Plan,
     TrainConfig,
     explain_value,
     given_overrides,
@@ -42,7 +41,7 @@ from dsr.app.schema import (
 )
 from dsr.utils import interruption
 from dsr.utils.configuration import ConfigError, config_directories
-from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, show
+from dsr.utils.console import USAGE_ERROR, one_line, print_error
 from dsr.utils.files import FullDiskError
 from dsr.utils.guards import OutOfMemoryError, did_you_mean, refusing_excess
 
@@ -148,7 +147,7 @@ def explain(error: Exception) -> str:
 
 
 class CheckJobs(Callback):
-    """Hydra's callback that plans each job of a multirun of Hydra's own sweeper, and prints how much there is to do."""
+    """Hydra's callback that checks each job of a multirun of Hydra's own sweeper before the first one begins."""
 
     def on_multirun_start(self, config: DictConfig, config_name: str | None = None, **_: Any) -> None:
         """Exit with 2 if a job cannot be run."""
@@ -163,7 +162,6 @@ class CheckJobs(Callback):
             composed = [(job, loader.load_sweep_config(config, job)) for job in jobs]
         except HydraException as error:
             fail(explain(error))
-        plans: list[Plan] = []
         problems: list[str] = []
         owners: dict[Path, Identity] = {}
         for job, whole in composed:
@@ -172,10 +170,9 @@ class CheckJobs(Callback):
             with read_write(own), open_dict(own):
                 del own["hydra"]
             try:
-                for plan in module_of(str(config_name), own).plan(own):
-                    plans.append(plan)
-                    if owners.setdefault(plan.folder.resolve(), plan.identity) != plan.identity:
-                        raise ConfigError(f"output_dir: expected one for each job, got {plan.folder} for several")
+                for folder, identity in module_of(str(config_name), own).check(own):
+                    if owners.setdefault(folder.resolve(), identity) != identity:
+                        raise ConfigError(f"output_dir: expected a directory for each job, got {folder} for several")
             except (ConfigError, OSError, OmegaConfBaseException) as error:
                 problems.append(f"{' '.join(job)}: {one_line(error)}")
         if problems:
@@ -183,7 +180,3 @@ class CheckJobs(Callback):
             for problem in problems:
                 print_error(problem)
             sys.exit(USAGE_ERROR)
-        left, done = sum(plan.left for plan in plans), sum(plan.done for plan in plans)
-        more = f" ({done} more are complete)" if done else ""
-        for unit in {plan.unit for plan in plans}:
-            show(open_console(), f"{len(plans)} runs, {unit}s to do: {left}{more}")

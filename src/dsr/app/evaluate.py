@@ -32,7 +32,6 @@ from dsr.app.schema import (
     Config,
     EvalConfig,
     Identity,
-    Plan,
     compose,
     given_keys,
     given_overrides,
@@ -45,7 +44,6 @@ from dsr.degradation.downsampling import Downsampling, Measured
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
 from dsr.evaluation.results import Run as StoredRun
-from dsr.evaluation.results import prediction_path
 from dsr.evaluation.run_files import read_run
 from dsr.evaluation.scenes import (
     Evaluation,
@@ -88,15 +86,10 @@ def evaluate(config: DictConfig) -> float:
     return means.get(_OBJECTIVE, next(iter(means.values()), math.nan))
 
 
-def plan(config: DictConfig) -> list[Plan]:
-    """Check what :func:`evaluate` would run as a job of a multirun; nothing is computed or written."""
-    plans = []
+def check(config: DictConfig) -> Iterator[tuple[Path, Identity]]:
+    """Check what :func:`evaluate` would do as a job of a multirun, and write nothing; yield directory and identity."""
     for prepared, _, _ in _studies(config, here=runs_here()):
-        scenes = prepared.source.scenes()
-        there = sum(prediction_path(prepared.folder, scene).is_file() for scene in scenes)
-        done = 0 if prepared.settings.overwrite else there
-        plans.append(Plan(prepared.folder, prepared.identity, "scene", len(scenes) - done, done))
-    return plans
+        yield prepared.folder, prepared.identity
 
 
 def _studies(config: DictConfig, *, here: bool = True) -> Iterator[tuple[_Prepared, Method, ConsoleProgress]]:

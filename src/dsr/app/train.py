@@ -30,7 +30,6 @@ from dsr.app.schema import (
     READ_OF_TRAINER,
     Config,
     Identity,
-    Plan,
     TrainConfig,
     given_keys,
     given_overrides,
@@ -76,15 +75,14 @@ def train(config: DictConfig) -> float:
         return _train(_prepare(plain, settings, device, processes))
 
 
-def plan(config: DictConfig) -> list[Plan]:
-    """Check what :func:`train` would do as a job of a multirun; nothing is computed or written."""
+def check(config: DictConfig) -> Iterator[tuple[Path, Identity]]:
+    """Check what :func:`train` would do as a job of a multirun, and write nothing; yield its directory and identity."""
     here = runs_here()
     plain, settings, device = _read(config, here=here)
     prepared = _prepare(plain, settings, device, find_processes(device, settings.trainer["devices"] if here else 1))
     elsewhere = () if here else ("device", "precision")
     rundir.expect_free(prepared.folder, plain, prepared.identity, (*prepared.tolerated, *elsewhere))
-    done = settings.steps if (prepared.folder / WEIGHTS).exists() and not settings.overwrite else 0
-    return [Plan(prepared.folder, prepared.identity, "step", settings.steps - done, done)]
+    yield prepared.folder, prepared.identity
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, metadata
 
 from rich.console import Console
+from rich.prompt import Confirm
 from rich.table import Table
 
 from dsr.app.requests import (
@@ -97,7 +98,8 @@ def get_data_sets(request: DataGetRequest, console: Console) -> list[str]:
         _describe(collection, console)
     if items:
         show(console, f"{missing} of {len(items)} files are missing in {root.absolute()}")
-    if missing and not request.yes and sys.stdin.isatty() and console.is_terminal and not _agreed(console):
+    asks = missing and not request.yes and sys.stdin.isatty() and console.is_terminal
+    if asks and not Confirm.ask("fetch them?", console=console, default=True):
         return []
     problems = []
     if items:
@@ -118,16 +120,6 @@ def _describe(collection: Collection, console: Console) -> None:
         lines = textwrap.wrap(text, max(console.width - 12, 20), break_long_words=False, break_on_hyphens=False)
         for number, line in enumerate(lines):
             show(console, f"  {'' if number else key:<9} {line}")
-
-
-def _agreed(console: Console) -> bool:
-    """Ask for confirmation, and return whether the user agrees."""
-    console.print("fetch them? [Y/n] ", markup=False, highlight=False, end="")
-    try:
-        answer = console.input()
-    except EOFError:
-        return False
-    return answer.strip().lower() in ("", "y", "yes")
 
 
 def verify_data_sets(request: DataVerifyRequest, console: Console) -> list[str]:
