@@ -168,7 +168,6 @@ def _prepare(
 
 
 def _source(settings: EvalConfig) -> SceneSource:
-    """Build the data set of the configuration."""
     if "parts" in settings.dataset:
         name = settings.names["dataset"]
         raise ConfigError(f"dataset={name}: several data sets are for training; name one of them")
@@ -208,7 +207,6 @@ def _workers(prepared: _Prepared) -> tuple[int, int]:
 
 
 def _method(prepared: _Prepared, progress: Progress) -> Method:
-    """Build the method of a run."""
     settings, downsampling, known = prepared.settings, prepared.downsampling, Known()
     if isinstance(downsampling, Downsampling):  # nothing is known of the maps of a sensor
         edges: Literal["soft", "sharp"] = "soft" if prepared.source.soft_edges else "sharp"
@@ -362,7 +360,6 @@ def _seed(seed: int) -> None:
 
 
 def _report(run: StoredRun, results: Mapping[str, SceneResult], formats: Formats) -> None:
-    """Print the table of scores, notes and failures."""
     console = open_console()
     if not run.scores.empty:
         for table in score_tables(run, formats):

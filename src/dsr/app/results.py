@@ -153,7 +153,6 @@ def _difference(frames: Sequence[Path], max_error: float) -> str:
 
 
 def _load(folder: Path, max_error: float) -> PosedMap:
-    """Return a result."""
     path, info = folder / INFO, read_complete(folder)
     if info.get("pose") is None:
         raise ValueError(f"{path}: expected a pose; run `dsr upsample` on a capture with poses, or with --poses")

@@ -211,7 +211,6 @@ def at_work(
 
 
 def _changes(before: Config, now: Config, prefix: str = "") -> list[str]:
-    """Return the dotted keys whose values differ."""
     changed = []
     for key in sorted(before.keys() | now.keys()):
         old, new = before.get(key), now.get(key)

@@ -45,13 +45,21 @@ from dsr.training.callbacks import log_layout
 from dsr.training.data_module import PatchData
 from dsr.training.module import SuperResolution
 from dsr.utils import interruption
-from dsr.utils.checkpoints import BestCheckpoint, DivergenceError, Interruption
+from dsr.utils.checkpoints import (
+    BestCheckpoint,
+    DivergenceError,
+    Interruption,
+    ScoreTables,
+    StepProgress,
+    fit,
+    make_trainer,
+    without_chatter,
+)
 from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError, build, expect_library
 from dsr.utils.console import USAGE_ERROR, ConsoleProgress, one_line, without_credentials
 from dsr.utils.files import replacing
 from dsr.utils.guards import did_you_mean
-from dsr.utils.lightning import ScoreTables, StepProgress, fit, make_trainer, without_chatter
 from dsr.utils.progress import Progress
 from dsr.utils.runs_table import list_run
 from dsr.utils.torch_files import read_torch_file
@@ -229,7 +237,6 @@ def _prepare(plain: Config, settings: TrainConfig, device: torch.device, process
 
 
 def _network(settings: TrainConfig) -> DisparityNetwork:
-    """Build the network, with initial weights if they are given."""
     net: DisparityNetwork = build("model.net", settings.model["net"])
     for key, take in (("weights", net.start_from), ("shared", net.share)):
         given = getattr(settings.start, key)
@@ -280,7 +287,6 @@ def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData) -> Su
 
 
 def _own_callbacks(settings: TrainConfig, module: SuperResolution) -> list[Callback]:
-    """Build the callbacks of the configuration."""
     scored: Any = module.metrics[0]
     kinds = ["val", *(f"{kind}_{each}" for kind in ("val", "bicubic") for each in module.sets), "bicubic"]
     known = [f"{kind}/{name}" for kind in kinds for name in scored]
@@ -338,7 +344,6 @@ def _train(prepared: _Prepared) -> float:
 
 
 def _fit(prepared: _Prepared) -> float:
-    """Train in the directory of the run; return the score of the weights that are kept."""
     plain, settings, folder = prepared.plain, prepared.settings, prepared.folder
     data, module, trainer = prepared.data, prepared.module, prepared.trainer
     groups = ("model", "dataset", "downsampling", "noise", "degradation", "trainer")

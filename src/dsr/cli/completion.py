@@ -76,7 +76,6 @@ def words_at_end(parser: Parser, line: str) -> list[str]:
 
 
 def _names_of(action: argparse.Action) -> list[str]:
-    """Return the known names that may stand for a value."""
     return [str(name) for name in action.choices or _NAMES.get(action.dest, tuple)()]
 
 
@@ -91,7 +90,6 @@ def _overrides(last: str) -> list[str]:
 
 
 def _split(line: str) -> list[str]:
-    """Return the words of a line, of which the last one may be empty."""
     words = line.split()
     with contextlib.suppress(ValueError):  # a quote that is not closed yet
         words = shlex.split(line)

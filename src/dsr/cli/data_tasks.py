@@ -113,7 +113,6 @@ def get_data_sets(request: DataGetRequest, console: Console) -> list[str]:
 
 
 def _describe(collection: Collection, console: Console) -> None:
-    """Show a collection's title, size, page, licence and citation."""
     size = "" if collection.size is None else f", about {megabytes(collection.size)}"
     show(console, f"{collection.name}: {collection.title}{size}")
     for key, text in (("page", collection.homepage), ("licence", collection.licence), ("cite", collection.citation)):

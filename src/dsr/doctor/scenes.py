@@ -273,7 +273,6 @@ def _marks(scene: Scene, depth: Array) -> list[Finding]:
 
 
 def _judge(where: np.ndarray, value: float, beside: float, fraction: float) -> list[Finding]:
-    """Return a finding if an extreme value that many pixels have is, or may be, a mark."""
     smallest = value < beside
     apart = max(value, beside) / min(value, beside) > _GAP
     mark = value < _TINY if smallest else bool(np.isclose(value, _MARKS, rtol=1e-5, atol=0).any())

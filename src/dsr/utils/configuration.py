@@ -57,7 +57,6 @@ def build(group: str, node: Any, given: Mapping[str, Any] | None = None, name: s
 
 
 def _make(group: str, node: Node, given: Mapping[str, Any], name: str | None = None) -> Any:
-    """Build the object, or the partial, that a node describes."""
     target, arguments = _checked(group, node, given, name)
     arguments = {key: _built(f"{group}.{key}", value) for key, value in arguments.items()}
     if node.get(_PARTIAL):

@@ -123,7 +123,6 @@ def group(record: Callable[[], Any] | None = None, title: str = "") -> Any:
 
 
 def _options_of(record: type) -> Iterator[_Option]:
-    """Yield the options and groups of a record, in order."""
     hints = get_type_hints(record)
     for each in fields(record):
         stated, kind = each.metadata[_KEY], hints[each.name]
@@ -190,7 +189,6 @@ def add_options(place: Any, record: type[Options], *, needed: bool = True) -> No
 
 
 def _of_values(each: _Option) -> dict[str, Any]:
-    """Return argparse's arguments of an option with a value: how many there are, and of which type."""
     keywords: dict[str, Any] = {} if each.metavar is None else {"metavar": each.metavar}
     if each.repeated:
         keywords["action"] = "append"

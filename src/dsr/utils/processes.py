@@ -191,7 +191,6 @@ class Pool:
 
 
 def _begin(plan: bytes, threads: int | None) -> None:
-    """Prepare a worker, which ends with its parent."""
     interruption.end_with(os.getppid())
     if threads is not None:
         _set_threads(threads, threads)

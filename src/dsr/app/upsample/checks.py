@@ -172,7 +172,6 @@ def _check_order(compared: Sequence[tuple[Pair, Outlines, Outlines]]) -> list[As
 
 
 def _doubts(verdict: Verdict) -> list[Assumption]:
-    """Return a warning if a pair can hardly belong together."""
     if not verdict.code:
         return []
     cure = {

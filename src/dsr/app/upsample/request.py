@@ -271,7 +271,6 @@ def _inputs(pair: Pair, reading: Reading) -> dict[str, Path | Source]:
 
 
 def _inputs_of(pair: Pair, reading: Reading) -> dict[str, Record]:
-    """Return the inputs and their hashes, as values for JSON."""
     inputs: dict[str, Record] = {}
     for name, each in _inputs(pair, reading).items():
         if not isinstance(each, Path):
