@@ -253,7 +253,7 @@ class DataVerifyRequest(Options):
 class DataGetRequest(DataVerifyRequest):
     """Fetch what is missing. Run the same command again to continue an interrupted download."""
 
-    mirror: str | None = option(None, "a server to try first, see below", "URL")
+    mirror: str | None = option(None, "a server to try first, see docs/data.md", "URL")
     yes: bool = option(False, "do not ask", flags="--yes -y")
     keep_archives: bool = option(False, "keep archives after unpacking")
 

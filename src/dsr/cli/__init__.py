@@ -192,15 +192,11 @@ COMMANDS = (
     Command("upsample", UpsampleRequest, "dsr.app.upsample.run:run", """\
 examples:
   dsr upsample --rgb photo.jpg --depth depth.png -o out
-  dsr upsample --rgb photo.jpg --depth depth.png --camera camera.json -o out
   dsr upsample --rgb photo.jpg --depth depth.exr --fov 70 --format exr --only depth,mesh -o out
-  dsr upsample --rgb a.jpg b.jpg --depth a.png b.png --intrinsics 615 615 319.5 239.5 -o out
   dsr upsample --rgb rgb/ --depth depth/ --depth-unit 1/5000 -o out
-  dsr upsample rgbd_dataset_freiburg1_xyz -o out
   dsr upsample scan.r3d --min-confidence 0.5 -o out
   dsr upsample --rgb photo.jpg --depth depth.png --method tgv --set data_weight=30 -o out
   dsr upsample recordings --with nerfstudio,open3d -o out
-  dsr upsample --rgb photo.jpg --depth depth.png --depth-camera ir.json --extrinsics ir_to_rgb.txt -o out
   dsr upsample recording --poses groundtruth.txt --neighbours 4 -o out
   dsr upsample recordings --shard 3/16 -o out    the third of 16 parts, for a task of an array
   dsr upsample recordings --dry-run -o out       what would be done, and what would be assumed
@@ -262,15 +258,7 @@ Join the table to a report: dsr report RUNS --study study/study.csv
     Command("data list", requests.DataListRequest, "dsr.cli.data_tasks:list_data_sets"),
     Command("data where", requests.DataWhereRequest, "dsr.cli.data_tasks:show_folders"),
     Command("data get", requests.DataGetRequest, "dsr.cli.data_tasks:get_data_sets", """\
-A file has to have the SHA-256 that dsr knows. Where it knows none, that of the first download is written into
-checksums.json, and later ones have to match it; `dsr data list` shows which.
-
-A mirror has every file under the same path as below the directory of the data sets, and every archive in the folder
-of its data set:
-  URL/middlebury2014/Vintage-perfect/im0.png
-  URL/sunrgbd/SUNRGBD.zip
-  URL/icl_nuim/office_room_traj0_frei_png.tar.gz
-An archive that you put there by hand is used instead of being downloaded, and kept.
+What a mirror has to hold, and which checksums are known, is in docs/data.md.
 """),
     Command("data verify", requests.DataVerifyRequest, "dsr.cli.data_tasks:verify_data_sets"),
     Command("data prepare", requests.DataPrepareRequest, "dsr.app.evaluate:prepare_dataset"),
@@ -287,9 +275,7 @@ examples:
   dsr export --onnx msg_v_x8.onnx --method msg_v --scale 8
   dsr export --onnx mine.onnx --method pdn --weights outputs/train/mine/weights.safetensors
 
-Inputs: photo (1, 3, H, W) in 0..1, inverse_depth (1, 1, h, w) in 1 / metres, valid (1, 1, h, w) bool, with H = N h and
-W = N w. Output: inverse_depth_hr (1, 1, H, W); of facets also relative_error, that of the depth, and angle_error in
-degrees. docs/python.md has a program that runs such a file.
+docs/python.md has its inputs and outputs, and a program that runs such a file.
 """),
     Command("completion", requests.CompletionRequest, "dsr.cli.completion:complete", """\
 examples:
