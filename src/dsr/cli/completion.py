@@ -16,7 +16,7 @@ from dsr.app.requests import SHELLS, CompletionRequest
 from dsr.cli import Parser, make_parser
 from dsr.data.download.collections import CATALOGUE
 from dsr.geometry.lights import LIGHT_NAMES
-from dsr.utils.configuration import config_directories, list_choices, list_groups
+from dsr.utils.configuration import config_directories, list_choices
 
 _SCRIPTS = {
     "bash": """\
@@ -85,8 +85,8 @@ def _overrides(last: str) -> list[str]:
     key, equals, _ = last.partition("=")
     if equals:
         return [f"{key}={choice}" for choice in list_choices(key.lstrip("+"), directories)]
-    groups = [f"{group}=" for group in list_groups(directories)]
-    return [f"+{each}" if each == "experiment=" else each for each in groups] + [*_HYDRA_FLAGS]
+    groups = sorted(path.name for path in directories[0].iterdir() if path.is_dir())
+    return [f"+{each}=" if each == "experiment" else f"{each}=" for each in groups] + [*_HYDRA_FLAGS]
 
 
 def _split(line: str) -> list[str]:

@@ -170,9 +170,3 @@ def config_directories(more: Sequence[Path] = ()) -> tuple[Path, ...]:
 def list_choices(group: str, directories: Sequence[Path]) -> list[str]:
     """Return the sorted names of the files of a group, such as ``method``, in all directories."""
     return sorted({path.stem for directory in directories for path in (directory / group).glob("*.yaml")})
-
-
-def list_groups(directories: Sequence[Path]) -> list[str]:
-    """Return the sorted names of the groups in all directories, without those of Hydra's own settings."""
-    names = {path.name for directory in directories for path in directory.iterdir() if path.is_dir()}
-    return sorted(names - {"hydra"})
