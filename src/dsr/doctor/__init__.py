@@ -43,7 +43,7 @@ def show_findings(console: Console, title: str, findings: Sequence[Finding], *, 
             if finding.advice:
                 grid.add_row("", "", Text(f"-> {finding.advice}", "dim"))
     counts = Counter(finding.level for finding in findings)
-    worst = max(counts, key=LEVELS.index, default="ok")
+    worst: Level = max(counts, key=LEVELS.index) if counts else "ok"
     parts = [] if worst in ("warning", "problem") else ["fine"]
     parts += [f"{counts[each]} {each}{'s' if counts[each] > 1 else ''}" for each in LEVELS[:0:-1] if counts[each]]
     console.print(Text.assemble((title, "bold"), ": ", (", ".join(parts), _COLOURS[worst])), soft_wrap=True)

@@ -217,8 +217,8 @@ def build(record: type[Record], given: Namespace) -> Record:
     options = _with_those_of_groups(record)
     values = dict(vars(given))
     for each in options:
-        chosen = values.get(each.key) if each.presets else None
-        for key, value in each.presets.get(chosen, {}).items():
+        chosen = each.presets.get(values[each.key], {}) if each.presets and each.key in values else {}
+        for key, value in chosen.items():
             if values.setdefault(key, value) != value:
                 flag = next(other.flag for other in options if other.key == key)
                 wrong = f"expected {flag} {value} or none with it, got {flag} {values[key]}"
