@@ -16,7 +16,13 @@ from typing import Any, Literal
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import Callback, LearningRateMonitor
+from lightning.pytorch.callbacks import (
+    Callback,
+    GradientAccumulationScheduler,
+    LearningRateMonitor,
+    ModelCheckpoint,
+    ProgressBar,
+)
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins import environments
 from lightning.pytorch.utilities import rank_zero_only
@@ -392,5 +398,10 @@ def _own_callbacks(settings: TrainConfig, module: SuperResolution) -> list[Callb
             raise ConfigError(f"callbacks.{name}.monitor: expected {expected}, got {monitor}{near}")
         if isinstance(each, LearningRateMonitor) and not settings.logger:
             raise ConfigError(f"callbacks.{name}: expected a logger to write to, such as logger=csv, got none")
+        if isinstance(each, ProgressBar | GradientAccumulationScheduler):
+            what = "shows progress, which dsr does, or accumulates batches, which trainer.accumulate_grad_batches does"
+            raise ConfigError(f"callbacks.{name}: expected none that {what}; leave it out")
+        if isinstance(each, ModelCheckpoint):  # whose keys would be alike
+            each.__class__ = type(type(each).__name__, (type(each),), {"state_key": f"callbacks.{name}"})
         own.append(each)
     return own
