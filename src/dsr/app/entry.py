@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 
 import hydra
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -80,13 +81,13 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
     except KeyboardInterrupt as interrupted:
         sys.exit(interruption.stop(str(interrupted)))
     except (HydraException, OmegaConfBaseException) as error:
-        fail(explain(error))
+        fail(_damaged_file() or explain(error))
     except (ConfigError, OSError, FullDiskError, YAMLError, BrokenExecutor) as error:
-        fail(one_line(error))
-    except ValueError as error:
+        fail(_damaged_file() or one_line(error))
+    except (ValueError, RecursionError) as error:
         if begun:  # a defect of the command's
             raise
-        fail(f"{' '.join(sys.argv[1:])}: {one_line(error)}")  # of Hydra's, which names no key
+        fail(_damaged_file() or f"{' '.join(sys.argv[1:])}: {one_line(error)}")  # of Hydra's, which names no key
     finally:
         sys.argv = process
 
@@ -123,6 +124,17 @@ def fail(message: str) -> NoReturn:
     """Print one line on stderr and exit with 2."""
     print_error(message)
     sys.exit(USAGE_ERROR)
+
+
+def _damaged_file() -> str:
+    """Return why the user's configuration files cannot be read, one line; empty if they can."""
+    folder = get_args_parser().parse_known_args(sys.argv[1:])[0].config_dir
+    for path in sorted(Path(folder).glob("*/*.yaml")) if folder is not None else ():
+        try:
+            OmegaConf.load(path)
+        except Exception as error:  # damaged YAML raises many types
+            return f"{path}: expected a readable YAML file, got {type(error).__name__}"
+    return ""
 
 
 def explain(error: Exception) -> str:
