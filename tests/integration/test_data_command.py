@@ -94,7 +94,7 @@ def test_command_asks_before_the_first_byte_on_a_terminal(mirror, root):
         process = subprocess.Popen(get, stdin=theirs, stdout=theirs, stderr=theirs, env=environment)
         os.close(theirs)
         said = b""
-        while b"[Y/n]" not in said:
+        while b"fetch them?" not in said:
             assert select.select([ours], [], [], 30)[0], said
             said += os.read(ours, 1024)
         assert b"Scharstein" in said

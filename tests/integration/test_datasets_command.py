@@ -70,7 +70,7 @@ def test_prepare_draws_a_contact_sheet_and_errors_are_one_line(tmp_path, monkeyp
     wrong = {
         ("icl",): "dataset=icl: expected its files in nowhere/icl_nuim",
         ("icl", "dataset.sizes=3"): "dataset.sizes: unknown key; expected one of ",
-        ("paper_train",): "dataset=paper_train: expected one data set",
+        ("paper_train",): "dataset=paper_train: several data sets",
     }
     for arguments, message in wrong.items():
         assert refused_line(capsys, main(["data", "prepare", *arguments])).startswith(message)

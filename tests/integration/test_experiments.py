@@ -24,7 +24,9 @@ def test_paper_tables_in_small_are_evaluated_and_reported(tmp_path, capfd):
     assert [run.name for run in runs] == [
         f"{method}_x{scale}_simgeo_scenes-statue_size64_seed0" for method in ("bicubic", "nearest") for scale in (4, 8)
     ]
-    assert "note: left out, as not in" in capfd.readouterr().err
+    [note] = capfd.readouterr().err.splitlines()
+    assert note.startswith("note: left out, as not in")
+    assert "icl" in note
     assert main(["report", "outputs/eval", "-o", "report", "--only", "tables"]) == 0
     with (tmp_path / "report" / "tables" / "simgeo_x4_box.csv").open(newline="", encoding="utf-8") as file:
         assert {"Bicubic", "Nearest"} <= {row["method"] for row in csv.DictReader(file)}

@@ -85,12 +85,8 @@ class Shifted(DisparityNetwork):
 FILES = {
     "modules/outside.py": MODULE,
     "conf/metrics/mine.yaml": "defaults: [paper]\nextra: [outside.PSNR, outside.BRIGHTNESS]\nlpips: false\n",
-    "conf/method/constant.yaml": (
-        "# @package _global_\nlabel: Constant\nmethod:\n  _target_: outside.Constant\n  offset: 0.0\n"
-    ),
-    "conf/method/hinted.yaml": (
-        "# @package _global_\nlabel: Hinted\nmethod:\n  _target_: outside.Hinted\n  kernel: null\n  edges: auto\n"
-    ),
+    "conf/method/constant.yaml": "_target_: outside.Constant\noffset: 0.0\n",
+    "conf/method/hinted.yaml": "_target_: outside.Hinted\nkernel: null\nedges: auto\n",
     "conf/model/shifted.yaml": (
         "net:\n  _target_: outside.Shifted\n  scale: ${scale}\n"
         "objective:\n  _target_: dsr.training.objective.DepthObjective\n"
@@ -232,14 +228,7 @@ def test_network_from_outside_is_trained_evaluated_and_used(home):
     small = ("dataset.size=32", "dataset.scenes=[statue]", "metrics.lpips=false", "device=cpu")
     for command in (
         (str(REPOSITORY / "train.py"), "--config-dir", "conf", *TRAINING),
-        (
-            program,
-            "run=training",
-            "metrics.lpips=false",
-            "device=cpu",
-            "output_dir=net/run",
-            "trust=outside.Shifted",
-        ),
+        (program, "run=training", *small[2:], "output_dir=net/run", "trust=outside.Shifted"),
         (program, "--config-dir", "conf", "method=shifted", *small, "output_dir=net/shifted"),
     ):
         done = run(home, *command)

@@ -250,7 +250,7 @@ def test_results_without_poses_and_damaged_ones_are_refused(capture, capsys):
     assert len(capsys.readouterr().err.splitlines()) == 4
     assert mesh.is_file()
     assert ".ply" in refused_line(capsys, main(["fuse", str(out), "-o", str(capture.parent / "mesh.obj")]))
-    assert "found no info.json" in refused_line(capsys, main(["fuse", str(capture), "-o", str(mesh)]))
+    assert "got one without info.json" in refused_line(capsys, main(["fuse", str(capture), "-o", str(mesh)]))
 
 
 # poses that cannot be right

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Literal
 
 import pytest
-import torch
 from hydra.utils import instantiate
 
 from dsr.app.schema import EvalConfig
@@ -65,15 +64,10 @@ def refusal(keys, group="dataset", given=None):
     return str(caught.value)
 
 
-def test_group_keys_are_the_arguments_of_the_target():
-    toy = build("dataset", node(root="r", names=["a"], share=0.25, count=3, order="far", flag=True, file="f"))
-    assert toy.values == ("r", ["a"], 0.25, 3, "far", True, "f")
-
-
-def test_name_is_passed_to_a_target_that_takes_one(tmp_path):
-    (tmp_path / "scene").mkdir()
-    node = {"_target_": "dsr.data.folder.Folder", "root": str(tmp_path)}
-    assert build("dataset", node, {"name": "mine"}).name == "mine"
+def test_group_keys_are_the_arguments_of_the_target_which_gets_the_run_values_that_it_names():
+    keys = node(root="r", names=["a"], share=0.25, count=3, order="far", flag=True, file="f")
+    toy = build("dataset", keys, {"scale": 8, "device": "cpu"})
+    assert (toy.values, toy.scale) == (("r", ["a"], 0.25, 3, "far", True, "f"), 8)
 
 
 def test_nodes_among_the_arguments_are_built_first_and_a_partial_is_called_later():
@@ -84,10 +78,6 @@ def test_nodes_among_the_arguments_are_built_first_and_a_partial_is_called_later
     with pytest.raises(ConfigError, match=r"^dataset\.file\.x: unknown key; dataset\.file takes none"):
         build("dataset", node(root="r", file={"_target_": "toy_home.no_arguments", "x": 1}))
     assert instantiate(node(root="r", file={"_target_": "toy_home.no_arguments"})).values[-1] == "built"
-
-
-def test_target_gets_the_run_values_that_it_names():
-    assert build("method", node(root="r"), {"scale": 8, "device": "cpu"}).scale == 8
 
 
 @pytest.mark.parametrize(
@@ -129,27 +119,19 @@ def test_value_of_a_compatible_type_is_accepted(key, value):
 
 
 @pytest.mark.parametrize(
-    "target", [None, 3, "toy", "no_such_module.Toy", "toy_home.Tay", "", "..x", "toy_home.__name__"]
-)
-def test_missing_target_is_refused(target):
-    assert refusal({"_target_": target}, "method").startswith("method._target_: ")
-
-
-def test_device_auto_is_the_gpu_where_there_is_one():
-    assert pick_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
-    assert pick_device("cpu") == torch.device("cpu")
+    ("keys", "place"),
+    [*(({"_target_": target}, "._target_: ") for target in (None, 3, "toy", "no_such_module.Toy", "toy_home.Tay", "",
+                                                            "..x", "toy_home.__name__")),
+     *((keys, ": expected keys, _target_ among them, got ") for keys in (5, "simgeo", ["a"], None))],
+)  # fmt: skip
+def test_missing_target_is_refused(keys, place):
+    assert refusal(keys, "validation.x").startswith(f"validation.x{place}")
 
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:99", "meta", "", "cpu:x"])
 def test_device_that_this_machine_lacks_is_refused(name):
     with pytest.raises(ConfigError, match=r"^device: expected auto, cpu or a device of this machine, got "):
         pick_device(name)
-
-
-@pytest.mark.parametrize("group", [5, "simgeo", ["a"], None])
-def test_group_without_keys_is_refused(group):
-    with pytest.raises(ConfigError, match=r"^validation.x: expected keys, _target_ among them, got "):
-        build("validation.x", group)
 
 
 def settings(**changes):

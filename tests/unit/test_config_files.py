@@ -5,38 +5,28 @@ from pathlib import Path
 import pytest
 
 from dsr.utils import configuration
-from dsr.utils.configuration import config_directories, list_choices, list_groups
+from dsr.utils.configuration import config_directories, list_choices
 
 CHECKOUT = Path(__file__).resolve().parents[2] / "conf"
 
 
-def test_configuration_of_a_checkout_is_conf():
+def test_configuration_of_an_installed_package_goes_before_that_of_a_checkout(tmp_path, monkeypatch):
     assert config_directories() == (CHECKOUT,)
-
-
-def test_configuration_of_an_installed_package_comes_with_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(configuration, "_PLACES", (tmp_path / "conf", CHECKOUT))
+    assert config_directories() == (CHECKOUT,)
     (tmp_path / "conf").mkdir()
     (tmp_path / "conf" / "eval.yaml").touch()
-    monkeypatch.setattr(configuration, "_PLACES", (tmp_path / "conf", CHECKOUT))
     assert config_directories() == (tmp_path / "conf",)
+    monkeypatch.setattr(configuration, "_PLACES", (tmp_path,))
+    with pytest.raises(ValueError, match="the installation is incomplete"):
+        config_directories()
 
 
-def test_own_directories_are_searched_after_the_project_and_add_choices_and_groups(tmp_path):
+def test_own_directories_are_searched_after_the_project_and_add_choices(tmp_path):
     (tmp_path / "method").mkdir()
     (tmp_path / "method" / "mine.yaml").touch()
-    (tmp_path / "own").mkdir()
     directories = config_directories([tmp_path])
     assert directories == (CHECKOUT, tmp_path)
     assert {"bicubic", "mine"} <= set(list_choices("method", directories))
-    assert {"method", "own"} <= set(list_groups(directories))
-
-
-def test_missing_directory_is_refused_by_name(tmp_path):
     with pytest.raises(ValueError, match="--config-dir: expected a directory, got"):
         config_directories([tmp_path / "nowhere"])
-
-
-def test_incomplete_installation_is_refused_by_name(tmp_path, monkeypatch):
-    monkeypatch.setattr(configuration, "_PLACES", (tmp_path / "conf",))
-    with pytest.raises(ValueError, match="the installation is incomplete"):
-        config_directories()

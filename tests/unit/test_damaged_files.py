@@ -52,9 +52,9 @@ from dsr.report.surface_page import is_view
 from dsr.sample import DepthSample
 from dsr.utils import guards
 from dsr.utils.arrays import read_arrays
+from dsr.utils.checkpoints import fit, make_trainer
 from dsr.utils.console import one_line, print_error, printable
 from dsr.utils.guards import TooLargeError, is_number, parse_json, read_limited, read_member
-from dsr.utils.lightning import fit, make_trainer
 
 HUGE = "1" + "0" * 400
 NO_NUMBERS = ("true", "Infinity", HUGE, '"4"', "[]")  # as JSON; a float holds none of them

@@ -17,7 +17,7 @@ import pytest
 from download_server import DATES, PNG, serving
 from small_files import written
 
-from dsr.cli import main
+from dsr.cli import data_tasks, main
 from dsr.data.download import Collection, Item
 from dsr.data.download.fetching import Checksums, get, lock_directory, state, verify
 from dsr.utils.progress import Progress
@@ -430,15 +430,16 @@ def test_list_shows_which_checksums_are_pinned_noted_and_unknown(server, tmp_pat
     catalogue["mine"] = replace(
         catalogue["one"], items=(), manual="put it there", patterns=("*.png",), folders=("mine",)
     )
+    monkeypatch.setattr(data_tasks, "downloads", lambda: catalogue)
 
     def listed():
-        assert main(["data", "list"], catalogue) == 0
+        assert main(["data", "list"]) == 0
         return [re.split(r" {2,}", line.strip())[-1] for line in capsys.readouterr().out.splitlines()[1:]]
 
     assert listed() == ["1 pinned, 2 unknown", "pinned", "unknown", "unknown"]
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "x.png").write_bytes(PNG)
-    assert main(["data", "get", "two", "mine", "--yes"], catalogue) == 0
+    assert main(["data", "get", "two", "mine", "--yes"]) == 0
     capsys.readouterr()
     assert listed() == ["1 pinned, 1 noted, 1 unknown", "pinned", "noted", "noted"]
 

@@ -87,28 +87,21 @@ def test_job_gets_the_composed_configuration_and_no_directory_is_made(command, t
 
 
 @pytest.mark.parametrize(
-    ("raised", "message"),
+    ("raised", "ends", "message"),
     [
-        (ConfigError("dataset.root: first\n   second"), "dataset.root: first second\n"),
-        (PermissionError(13, "Permission denied", "x"), "x"),
-        (MemoryError(), "memory"),
+        (ConfigError("dataset.root: first\n   second"), 2, "dataset.root: first second\n"),
+        (PermissionError(13, "Permission denied", "x"), 2, "x"),
+        (MemoryError(), 2, "memory"),
+        (KeyboardInterrupt(), 130, "interrupted"),
     ],
 )
-def test_errors_of_the_job_are_one_line_and_exit_code_2(command, raised, message):
+def test_errors_of_the_job_and_an_interruption_are_one_line_with_their_exit_code(command, raised, ends, message):
     def job(config):
         raise raised
 
     code, error, _ = command(job=job)
-    assert (code, error.count("\n")) == (2, 1)
+    assert (code, error.count("\n")) == (ends, 1)
     assert message in error
-
-
-def test_interruption_is_one_line_and_exit_code_130(command):
-    def job(config):
-        raise KeyboardInterrupt
-
-    code, error, _ = command(job=job)
-    assert (code, error.count("\n")) == (130, 1)
 
 
 @pytest.mark.parametrize("kind", [ZeroDivisionError, ValueError])
@@ -137,12 +130,6 @@ def test_multirun_runs_every_combination_and_a_failing_job_keeps_the_others(comm
     ]  # fmt: skip
 
 
-def test_value_of_the_command_line_replaces_the_sweep_of_an_experiment(command):
-    code, _, seen = command("-m", "+experiment=noise", "noise=kinect", "method=bicubic,nearest", "scale=8")
-    assert code == 0
-    assert {(config.label, config.scale) for config in seen} == {("Bicubic", 8), ("Nearest", 8)}
-
-
 def test_config_dir_adds_choices(command, tmp_path):
     (tmp_path / "own" / "method").mkdir(parents=True)
     (tmp_path / "own" / "method" / "mine.yaml").write_text("_target_: dsr.methods.base.mine\nstrength: 1\n")
@@ -155,12 +142,3 @@ def test_config_dir_adds_choices(command, tmp_path):
     code, error, _ = command("--config-dir", "own", "method=mine")
     assert (code, error.count("\n")) == (2, 1)
     assert "mine.yaml" in error
-
-
-def test_run_command_takes_arguments_and_the_process_keeps_its_own(monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["dsr", "eval", "scale=8"])
-    seen = []
-    run_command("eval", lambda config: seen.append((config.scale, list(sys.argv))), ["scale=8"])
-    assert seen == [(8, ["dsr", "eval", "scale=8"])]
-    assert sys.argv == ["dsr", "eval", "scale=8"]

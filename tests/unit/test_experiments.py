@@ -76,13 +76,3 @@ def test_all_jobs_of_an_experiment_are_valid(name, tmp_path, monkeypatch):
         with pytest.raises(ConfigError, match="expected its files in") if absent else contextlib.nullcontext():
             build("dataset", plain["dataset"])
         assert issubclass(load_target("method", settings.method), Method)
-
-
-def test_paper_tables_runs_the_data_sets_that_are_here(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("DSR_DATA", str(tmp_path))
-    (tmp_path / "middlebury2014").mkdir()
-    (tmp_path / "simgeo").mkdir()
-    assert {job[-1] for job in sweep_of("paper_tables")} == {"dataset=simgeo", "dataset=middlebury"}
-    assert "left out" in (note := capsys.readouterr().err)
-    assert note.count("\n") == 1
-    assert "icl" in note

@@ -9,7 +9,7 @@ import torch
 from omegaconf import OmegaConf
 
 from dsr.app import run_directory as rundir
-from dsr.app.run_directory import at_work, default_directory, expect_free, identity_of
+from dsr.app.run_directory import at_work, directory_of, expect_free, identity_of
 from dsr.app.schema import compose, plain_config
 from dsr.utils.configuration import ConfigError, config_directories
 
@@ -19,18 +19,10 @@ CPU = torch.device("cpu")
 def config(**changes):
     return {
         "names": {"dataset": "folder", "downsampling": "box", "method": "msg_v"},
-        "dataset": {"root": "data", "scenes": None},
-        "downsampling": {"kernel": "box"},
-        "method": {},
-        "metrics": {"lpips": True},
-        "scale": 4,
-        "weights": "w.pth",
-        "precision": "float32",
-        "seed": 0,
-        "output_dir": None,
-        "overwrite": False,
-        **changes,
-    }
+        "dataset": {"root": "data", "scenes": None}, "downsampling": {"kernel": "box"}, "method": {}, "scale": 4,
+        "metrics": {"lpips": True}, "weights": "w.pth", "precision": "float32", "seed": 0, "output_dir": None,
+        "overwrite": False, **changes,
+    }  # fmt: skip
 
 
 def claim(folder, plain, weights="abc"):
@@ -49,7 +41,7 @@ def composed(kind, *overrides):
 
 def name_of(kind, *overrides):
     plain = composed(kind, *overrides)
-    return default_directory(kind, plain, identity_of(plain, None, CPU), overrides).name
+    return directory_of(kind, plain, identity_of(plain, None, CPU), overrides).name
 
 
 @pytest.mark.parametrize(
@@ -86,36 +78,30 @@ def test_what_a_name_cannot_say_is_distinguished_by_a_hash():
 def test_run_takes_the_directory_of_no_other_run_and_finds_its_own():
     plain, folders = composed("eval"), []
     for weights in ("abc", "abd"):
-        folders.append(default_directory("eval", plain, identity_of(plain, weights, CPU)))
+        folders.append(directory_of("eval", plain, identity_of(plain, weights, CPU)))
         claim(folders[-1], plain, weights)
     assert folders[0].name == "msg_v_x4_simgeo_seed0"
     assert re.fullmatch(r"msg_v_x4_simgeo_seed0-[0-9a-f]{8}", folders[1].name)
     record = json.loads((folders[1] / "versions.json").read_text())
     assert record["hash"].startswith(folders[1].name.rpartition("-")[2])
-    again = [default_directory("eval", plain, identity_of(plain, weights, CPU)) for weights in ("abc", "abd")]
+    again = [directory_of("eval", plain, identity_of(plain, weights, CPU)) for weights in ("abc", "abd")]
     assert again == folders
     (folders[0] / "versions.json").unlink()
     (folders[0] / "thesis.txt").touch()
-    assert default_directory("eval", plain, identity_of(plain, "abc", CPU)).name.startswith(f"{folders[0].name}-")
+    assert directory_of("eval", plain, identity_of(plain, "abc", CPU)).name.startswith(f"{folders[0].name}-")
 
 
-@pytest.mark.parametrize(
-    ("changes", "same"),
-    [
-        ({"scale": 8}, False), ({"seed": 1}, False), ({"precision": "bfloat16"}, False),
-        ({"dataset": {"root": "other"}}, False), ({"downsampling": {"kernel": "gaussian"}}, False),
-        ({"method": {"variant": "x"}}, False), ({"weights": "elsewhere.pth"}, True), ({"output_dir": "x"}, True),
-        ({"overwrite": True}, True), ({"metrics": {"lpips": False}}, True),
-    ],
-)  # fmt: skip
-def test_identity_has_the_settings_that_predictions_depend_on(changes, same):
-    assert (identity_of(config(**changes), "abc", CPU) == identity_of(config(), "abc", CPU)) is same
-
-
-def test_identity_has_the_weights_the_kind_of_device_and_the_versions(monkeypatch):
-    cuda = torch.device("cuda")
-    found = [identity_of(config(), *each) for each in (("abc", CPU), ("abd", CPU), (None, CPU), ("abc", cuda))]
-    assert identity_of(config(), "abc", torch.device("cuda", 1)) == found[3]
+def test_identity_has_the_settings_that_predictions_depend_on_the_weights_the_device_and_the_versions(monkeypatch):
+    own = identity_of(config(), "abc", CPU)
+    for same in ({"weights": "elsewhere.pth"}, {"output_dir": "x"}, {"overwrite": True}, {"metrics": {"lpips": False}}):
+        assert identity_of(config(**same), "abc", CPU) == own
+    other = (
+        {"scale": 8}, {"seed": 1}, {"precision": "bfloat16"}, {"dataset": {"root": "other"}},
+        {"downsampling": {"kernel": "gaussian"}}, {"method": {"variant": "x"}},
+    )  # fmt: skip
+    found = [own, *(identity_of(config(**changes), "abc", CPU) for changes in other)]
+    found += [identity_of(config(), *each) for each in (("abd", CPU), (None, CPU), ("abc", torch.device("cuda")))]
+    assert identity_of(config(), "abc", torch.device("cuda", 1)) == found[-1]
     for name in ("RESULTS", "SCENES"):
         monkeypatch.setattr(rundir, name, 0)
         found.append(identity_of(config(), "abc", CPU))
@@ -123,7 +109,10 @@ def test_identity_has_the_weights_the_kind_of_device_and_the_versions(monkeypatc
 
 
 def test_claimed_directory_has_the_config_and_the_versions(tmp_path):
+    (tmp_path / "new" / "run").mkdir(parents=True)
+    (tmp_path / "new" / "run" / ".versions-8f3k.json").touch()  # of another run that begins in it
     claim(tmp_path / "new" / "run", config())
+    (tmp_path / "new" / "run" / ".versions-8f3k.json").unlink()
     assert sorted(path.name for path in (tmp_path / "new" / "run").iterdir()) == ["config.yaml", "versions.json"]
     assert OmegaConf.to_container(OmegaConf.load(tmp_path / "new" / "run" / "config.yaml")) == config()
     record = json.loads((tmp_path / "new" / "run" / "versions.json").read_text())
@@ -151,12 +140,9 @@ def test_directory_of_another_run_is_refused_with_the_changed_keys_before_the_cl
         claim(tmp_path / "run", other, "abd")
     assert (tmp_path / "run" / "config.yaml").read_bytes() == before
     assert expect_free(tmp_path / "run", plain, identity, keys) == keys
-
-
-def test_directory_in_which_another_run_begins_can_be_claimed(tmp_path):
-    (tmp_path / ".versions-8f3k.json").touch()  # what replacing() writes before the record is there
-    claim(tmp_path, config())
-    assert (tmp_path / "versions.json").is_file()
+    claim(tmp_path / "run", {**other, "overwrite": True})
+    assert OmegaConf.load(tmp_path / "run" / "config.yaml").scale == 8
+    assert json.loads((tmp_path / "run" / "versions.json").read_text())["identity"]["scale"] == 8
 
 
 @pytest.mark.parametrize("content", [None, "", "[]", "{}", '{"identity": 3}', '{"identity": null}'])
@@ -168,13 +154,6 @@ def test_directory_with_foreign_files_is_refused_and_unchanged(tmp_path, content
     with pytest.raises(ConfigError, match=r"^output_dir: .* holds files of something else"):
         claim(tmp_path, config())
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
-def test_overwrite_claims_the_directory_of_another_run(tmp_path):
-    claim(tmp_path, config())
-    claim(tmp_path, config(scale=8, overwrite=True))
-    assert OmegaConf.load(tmp_path / "config.yaml").scale == 8
-    assert json.loads((tmp_path / "versions.json").read_text())["identity"]["scale"] == 8
 
 
 def test_file_in_place_of_the_directory_or_of_one_above_it_is_refused(tmp_path):

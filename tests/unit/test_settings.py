@@ -16,6 +16,7 @@ from dsr.methods.classical.interpolation import CubicConvolution, Interpolation
 from dsr.methods.classical.shape_from_shading import ShapeFromShading
 from dsr.methods.classical.tgv import TotalGeneralisedVariation
 from dsr.methods.dip.upsampler import DeepImagePrior
+from dsr.methods.external import External
 from dsr.methods.networks.ddrnet import DDRNet
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.pdn import PrimalDualNetwork
@@ -29,6 +30,10 @@ from dsr.training.settings import PatchSettings
 WRONG = {
     Interpolation: [("order", "cubic")],
     CubicConvolution: [("range_type", "depth")],
+    External: [
+        ("path", "nowhere"), ("file", "{seen}"), ("range_type", "depth"), ("fit", "cubic"), ("resize", "cubic"),
+        ("unit", "feet"),
+    ],
     Bilateral: [("window", 0), ("window", 2000), ("sigma_depth", 0), ("sigma_space", 0)],
     GuidedFilter: [("radius", 0), ("radius", 2000), ("epsilon", 0)],
     JointBilateral: [("radius", 0), ("sigma_space", 0), ("sigma_colour", 0)],
@@ -82,6 +87,7 @@ WRONG = {
 NEEDED = {
     DeepImagePrior: {"scale": 2, "downsampling": Downsampling("box")},
     Downsampling: {"kernel": "gaussian"},
+    External: {"path": "."},
     Peer: {"peer": SVLRM(4)},
     PrimalDualNetwork: {"scale": 4},
     SparseToDense: {"scale": 4},

@@ -41,9 +41,8 @@ from dsr.training.module import SuperResolution, WarmupCosine
 from dsr.training.objective import DepthObjective, SurfaceObjective, balance_weight, shading_loss, to_depth
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings
-from dsr.utils.checkpoints import Divergence, DivergenceError
+from dsr.utils.checkpoints import Divergence, DivergenceError, fit, make_trainer
 from dsr.utils.configuration import ConfigError
-from dsr.utils.lightning import fit, make_trainer
 
 BOX = Downsampling("box")
 X2 = Degradation(2, BOX)

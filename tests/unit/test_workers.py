@@ -1,7 +1,6 @@
 """Worker processes and locks: each item once, also where a worker is killed; settings keep a folder for themselves."""
 
 import functools
-import multiprocessing
 import os
 import signal
 import threading
@@ -12,9 +11,7 @@ import torch
 
 from dsr.report.worker_pool import WorkerPool
 from dsr.utils.files import replacing
-from dsr.utils.processes import LOCKS, InUseError, Pool, at_work, free_first, scene_lock
-
-SPAWN = multiprocessing.get_context("spawn")
+from dsr.utils.processes import LOCKS, InUseError, Pool, at_work, free_first
 
 
 def answer(kill, item):
@@ -73,41 +70,11 @@ def test_workers_that_are_ended_while_they_write_leave_no_temporary_file(tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
-def hold(folder, settings, scene, started):
-    with at_work(folder, settings), scene_lock(folder, scene):
-        started.set()
-        time.sleep(60)
-
-
-@pytest.fixture
-def holder(tmp_path):
-    """Return another process with the settings "its" that has the lock of "a" in a folder, and the folder."""
-    started = SPAWN.Event()
-    process = SPAWN.Process(target=hold, args=(tmp_path / "run", "its", "a", started))
-    process.start()
-    assert started.wait(60)
-    yield process, tmp_path / "run"
-    process.kill()
-    process.join()
-
-
-def test_other_settings_are_refused_until_the_process_ends_however_it_does(holder):
-    process, folder = holder
-    with pytest.raises(InUseError, match=f"process {process.pid} of "), at_work(folder, "others"):
-        pass
-    with at_work(folder, "its"):
-        assert next(free_first(folder, ["a", "b"])) == "b"
-        assert list(free_first(folder, ["a", "b"], wait=False)) == ["b"]
-        process.kill()
-        process.join()
-        assert list(free_first(folder, ["a", "b"])) == ["a", "b"]
-    with at_work(folder, "others"):
-        assert folder.is_dir()
-    assert list(folder.iterdir()) == []
-
-
-def test_folder_that_holds_something_is_kept_without_the_locks(tmp_path):
+def test_folder_is_for_commands_of_the_same_settings_and_kept_without_the_locks(tmp_path):
     with at_work(tmp_path / "new" / "run", "its"):
+        with pytest.raises(InUseError, match=f"process {os.getpid()} of "), at_work(tmp_path / "new" / "run", "others"):
+            pass
         assert (tmp_path / "new" / "run" / LOCKS).is_dir()
+        assert list(free_first(tmp_path / "new" / "run", ["a", "b"])) == ["a", "b"]
         (tmp_path / "new" / "run" / "file").touch()
     assert [path.name for path in (tmp_path / "new" / "run").iterdir()] == ["file"]

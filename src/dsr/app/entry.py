@@ -33,7 +33,6 @@ from yaml import YAMLError
 from dsr.app.schema import (
     EvalConfig,
     Identity,
-    Plan,
     TrainConfig,
     explain_value,
     given_overrides,
@@ -43,7 +42,7 @@ from dsr.app.schema import (
 )
 from dsr.utils import interruption
 from dsr.utils.configuration import ConfigError, config_directories
-from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, show
+from dsr.utils.console import USAGE_ERROR, one_line, print_error
 from dsr.utils.files import FullDiskError
 from dsr.utils.guards import OutOfMemoryError, did_you_mean, refusing_excess
 
@@ -77,17 +76,18 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
     process = sys.argv
     sys.argv = process if arguments is None else [process[0], *arguments]  # parsed by Hydra
     try:
-        places = str(config_directories()[0])
-        hydra.main(version_base="1.3", config_path=places, config_name=name)(_job(command, process, begun))()
+        place = str(config_directories()[0])
+        hydra.main(version_base="1.3", config_path=place, config_name=name)(_job(command, process, begun))()
     except KeyboardInterrupt as interrupted:
         sys.exit(interruption.stop(str(interrupted)))
     except (HydraException, OmegaConfBaseException) as error:
         fail(_damaged_file() or explain(error))
-    except (OSError, FullDiskError, ValueError, YAMLError, RecursionError, BrokenExecutor) as error:
-        if begun and isinstance(error, ValueError | RecursionError) and not isinstance(error, ConfigError):
-            raise  # a defect of the command's
-        of_hydra = isinstance(error, ValueError) and not isinstance(error, ConfigError)  # which names no key
-        fail(_damaged_file() or (f"{' '.join(sys.argv[1:])}: {one_line(error)}" if of_hydra else one_line(error)))
+    except (ConfigError, OSError, FullDiskError, YAMLError, BrokenExecutor) as error:
+        fail(_damaged_file() or one_line(error))
+    except (ValueError, RecursionError) as error:
+        if begun:  # a defect of the command's
+            raise
+        fail(_damaged_file() or f"{' '.join(sys.argv[1:])}: {one_line(error)}")  # of Hydra's, which names no key
     finally:
         sys.argv = process
 
@@ -129,11 +129,7 @@ def fail(message: str) -> NoReturn:
 def _damaged_file() -> str:
     """Return why the user's configuration files cannot be read, one line; empty if they can."""
     folder = get_args_parser().parse_known_args(sys.argv[1:])[0].config_dir
-    try:
-        own = config_directories([] if folder is None else [Path(folder)])[1:]
-    except ConfigError as error:
-        return str(error)
-    for path in sorted(path for place in own for path in place.glob("*/*.yaml")):
+    for path in sorted(Path(folder).glob("*/*.yaml")) if folder is not None else ():
         try:
             OmegaConf.load(path)
         except Exception as error:  # damaged YAML raises many types
@@ -163,7 +159,7 @@ def explain(error: Exception) -> str:
 
 
 class CheckJobs(Callback):
-    """Hydra's callback that plans each job of a multirun of Hydra's own sweeper, and prints how much there is to do."""
+    """Hydra's callback that checks each job of a multirun of Hydra's own sweeper before the first one begins."""
 
     def on_multirun_start(self, config: DictConfig, config_name: str | None = None, **_: Any) -> None:
         """Exit with 2 if a job cannot be run."""
@@ -178,31 +174,21 @@ class CheckJobs(Callback):
             composed = [(job, loader.load_sweep_config(config, job)) for job in jobs]
         except HydraException as error:
             fail(explain(error))
-        plans: list[Plan] = []
         problems: list[str] = []
         owners: dict[Path, Identity] = {}
-        before = HydraConfig.instance().cfg
         for job, whole in composed:
             HydraConfig.instance().set_config(whole)
             own = copy.deepcopy(whole)
             with read_write(own), open_dict(own):
                 del own["hydra"]
             try:
-                for plan in module_of(str(config_name), own).plan(own):
-                    plans.append(plan)
-                    if owners.setdefault(plan.folder.resolve(), plan.identity) != plan.identity:
-                        raise ConfigError(
-                            f"output_dir: expected a directory for each job, got {plan.folder} for several"
-                        )
+                for folder, identity in module_of(str(config_name), own).check(own):
+                    if owners.setdefault(folder.resolve(), identity) != identity:
+                        raise ConfigError(f"output_dir: expected a directory for each job, got {folder} for several")
             except (ConfigError, OSError, OmegaConfBaseException) as error:
                 problems.append(f"{' '.join(job)}: {one_line(error)}")
-        HydraConfig.instance().cfg = before
         if problems:
             print_error(f"{len(problems)} of the jobs cannot be run, so none is begun")
             for problem in problems:
                 print_error(problem)
             sys.exit(USAGE_ERROR)
-        left, done = sum(plan.left for plan in plans), sum(plan.done for plan in plans)
-        more = f" ({done} more are complete)" if done else ""
-        for unit in {plan.unit for plan in plans}:
-            show(open_console(), f"{len(plans)} runs, {unit}s to do: {left}{more}")

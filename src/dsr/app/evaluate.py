@@ -1,4 +1,4 @@
-"""The command behind ``eval.py``: ``python eval.py -m dataset=simgeo,icl method=dip_v``."""
+"""The commands behind ``eval.py`` and ``dsr data prepare``: ``python eval.py -m dataset=simgeo,icl method=dip_v``."""
 
 from __future__ import annotations
 
@@ -19,16 +19,20 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 import torch
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 from dsr.app import run_directory as rundir
+from dsr.app.entry import explain
 from dsr.app.metrics import check_metrics, chosen_metrics, metric_collection
+from dsr.app.requests import DataPrepareRequest
 from dsr.app.schema import (
     Config,
     EvalConfig,
     Identity,
-    Plan,
+    compose,
     given_keys,
     given_overrides,
     plain_config,
@@ -40,7 +44,6 @@ from dsr.degradation.downsampling import Downsampling, Measured
 from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
 from dsr.evaluation.results import Run as StoredRun
-from dsr.evaluation.results import prediction_path
 from dsr.evaluation.run_files import read_run
 from dsr.evaluation.scenes import (
     Evaluation,
@@ -56,10 +59,10 @@ from dsr.methods.networks.weight_files import files_of_weights
 from dsr.methods.recipe import Known, Recipe, Run
 from dsr.metrics.formats import Formats
 from dsr.report.table_layouts import score_tables
-from dsr.sample import DepthSample
+from dsr.sample import DepthSample, Scene
 from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError
-from dsr.utils.console import ConsoleProgress, note_once, open_console, print_error, show
+from dsr.utils.console import ConsoleProgress, note_once, one_line, open_console, print_error, show
 from dsr.utils.guards import free_memory
 from dsr.utils.processes import Pool, computing_threads, free_first
 from dsr.utils.progress import SILENT, Progress
@@ -83,15 +86,10 @@ def evaluate(config: DictConfig) -> float:
     return means.get(_OBJECTIVE, next(iter(means.values()), math.nan))
 
 
-def plan(config: DictConfig) -> list[Plan]:
-    """Check what :func:`evaluate` would run as a job of a multirun; nothing is computed or written."""
-    plans = []
+def check(config: DictConfig) -> Iterator[tuple[Path, Identity]]:
+    """Check what :func:`evaluate` would do as a job of a multirun, and write nothing; yield directory and identity."""
     for prepared, _, _ in _studies(config, here=runs_here()):
-        scenes = prepared.source.scenes()
-        there = sum(prediction_path(prepared.folder, scene).is_file() for scene in scenes)
-        done = 0 if prepared.settings.overwrite else there
-        plans.append(Plan(prepared.folder, prepared.identity, "scene", len(scenes) - done, done))
-    return plans
+        yield prepared.folder, prepared.identity
 
 
 def _studies(config: DictConfig, *, here: bool = True) -> Iterator[tuple[_Prepared, Method, ConsoleProgress]]:
@@ -129,11 +127,7 @@ def _prepare(
 ) -> tuple[_Prepared, Method, ConsoleProgress]:
     """Check all that an evaluation needs, and write nothing; without a data set, it is that of the configuration."""
     settings = EvalConfig.of(plain)
-    if source is None:
-        if "parts" in settings.dataset:
-            name = settings.names["dataset"]
-            raise ConfigError(f"dataset={name}: several data sets are for training; name one of them")
-        source = as_source(settings.build("dataset"))
+    source = _source(settings) if source is None else source
     scale = _scale(settings, source)
     recipe = Recipe(settings.names["method"], OmegaConf.create(node), user_directories(), plain)
     if "downsampling.assumed" in given_keys() and not recipe.abilities.assumes_downsampling:
@@ -159,9 +153,7 @@ def _prepare(
     if len(hashes) > 1:
         weights_hash = hashlib.sha256("".join(hashes).encode()).hexdigest()
     identity = rundir.identity_of(plain, weights_hash, device, recipe.targets())
-    folder = Path(
-        settings.output_dir or rundir.default_directory("eval", plain, identity, given_overrides())
-    ).expanduser()
+    folder = rundir.directory_of("eval", plain, identity, given_overrides())
     downsampling, noise, holes = (settings.build(group) for group in ("downsampling", "noise", "holes"))
     degradation = rundir.degradation_of(plain, assumes=recipe.abilities.assumes_downsampling)
     prepared = _Prepared(
@@ -173,6 +165,13 @@ def _prepare(
     _workers(prepared)
     rundir.expect_free(folder, plain, identity, () if here else ("device", "precision"))
     return prepared, method, progress
+
+
+def _source(settings: EvalConfig) -> SceneSource:
+    if "parts" in settings.dataset:
+        name = settings.names["dataset"]
+        raise ConfigError(f"dataset={name}: several data sets are for training; name one of them")
+    return as_source(settings.build("dataset"))
 
 
 def _scale(settings: EvalConfig, source: SceneSource) -> float:
@@ -208,7 +207,6 @@ def _workers(prepared: _Prepared) -> tuple[int, int]:
 
 
 def _method(prepared: _Prepared, progress: Progress) -> Method:
-    """Build the method of a run."""
     settings, downsampling, known = prepared.settings, prepared.downsampling, Known()
     if isinstance(downsampling, Downsampling):  # nothing is known of the maps of a sensor
         edges: Literal["soft", "sharp"] = "soft" if prepared.source.soft_edges else "sharp"
@@ -239,6 +237,21 @@ def _study(prepared: _Prepared, method: Method) -> Evaluation:
         name, label = f"{name}_{method.flag}", f"{label} ({method.flag})"
     metrics = chosen_metrics(settings.metrics, prepared.source.regions)
     formats = {metric.name: metric.format for metric in metrics}
+
+    def illustrate(
+        sample: DepthSample,
+        depth: torch.Tensor,
+        errors: tuple[torch.Tensor, torch.Tensor] | None,
+        scores: Mapping[str, float],
+    ) -> None:
+        """Draw the result of a scene, and its expected errors if there are any."""
+        from dsr.pictures.panels import save_picture, write_confidence  # noqa: PLC0415 - slow to import
+
+        save_picture(folder / "pictures" / f"{sample.scene}.png", sample, depth, scores, label, formats)
+        if errors is not None:
+            path = folder / "confidence" / f"{sample.scene}.png"
+            write_confidence(path, depth, *errors, sample.depth, sample.camera)
+
     return Evaluation(
         folder,
         prepared.source,
@@ -255,7 +268,7 @@ def _study(prepared: _Prepared, method: Method) -> Evaluation:
         holes=prepared.holes,
         alignment=settings.metrics.alignment,
         label=label,
-        illustrate=functools.partial(_illustrate, folder, label, formats),
+        illustrate=illustrate,
     )
 
 
@@ -276,7 +289,7 @@ def _run(prepared: _Prepared, method: Method, progress: ConsoleProgress) -> pd.D
         scores = write_tables(study, results)
         run = read_run(folder)
         save_dashboard(run)
-    _report(open_console(), run, results, {metric.name: metric.format for metric in study.metrics})
+    _report(run, results, {metric.name: metric.format for metric in study.metrics})
     failed = [scene for scene, each in results.items() if each.failure]
     if failed:
         rest = f"; the others are in {folder}" if len(failed) < len(results) else ""
@@ -345,26 +358,8 @@ def _seed(seed: int) -> None:
     torch.manual_seed(seed)
 
 
-def _illustrate(
-    folder: Path,
-    label: str,
-    formats: Formats,
-    sample: DepthSample,
-    depth: torch.Tensor,
-    errors: tuple[torch.Tensor, torch.Tensor] | None,
-    scores: Mapping[str, float],
-) -> None:
-    """Draw the result of a scene, and its expected errors if there are any."""
-    from dsr.pictures.panels import save_picture, write_confidence  # noqa: PLC0415 - slow to import
-
-    save_picture(folder / "pictures" / f"{sample.scene}.png", sample, depth, scores, label, formats)
-    if errors is not None:
-        path = folder / "confidence" / f"{sample.scene}.png"
-        write_confidence(path, depth, *errors, sample.depth, sample.camera)
-
-
-def _report(console: Console, run: StoredRun, results: Mapping[str, SceneResult], formats: Formats) -> None:
-    """Print the table of scores, notes and failures."""
+def _report(run: StoredRun, results: Mapping[str, SceneResult], formats: Formats) -> None:
+    console = open_console()
     if not run.scores.empty:
         for table in score_tables(run, formats):
             console.print(table)
@@ -379,5 +374,38 @@ def _report(console: Console, run: StoredRun, results: Mapping[str, SceneResult]
         lines.append(f"predictions re-used: {reused} (overwrite=true computes them again)")
     for line in (*lines, f"results: {run.folder}"):
         show(console, line)
-    for message in filter(None, (result.failure for result in results.values())):
-        print_error(message)
+    for result in results.values():
+        if result.failure:
+            print_error(result.failure)
+
+
+def prepare_dataset(request: DataPrepareRequest, console: Console) -> list[str]:
+    """Prepare every scene of a data set and draw the contact sheet, ``outputs/data/NAME/sheet.png`` or its pages."""
+    from dsr.pictures.sheets import save_contact_sheet  # noqa: PLC0415 - slow to import
+
+    name, directories = request.name, [] if request.config_dir is None else [request.config_dir]
+    try:
+        settings = EvalConfig.of(plain_config(compose("eval", [f"dataset={name}", *request.settings], directories)))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(explain(error)) from error
+    source = _source(settings)
+    progress, failures = ConsoleProgress(console), list[str]()
+    prepare_scenes(source, source.scenes(), progress)
+
+    def loaded() -> Iterator[Scene]:
+        for scene in progress.track(source.scenes(), "draw"):
+            try:
+                yield source.load(scene)
+            except (ValueError, OSError) as error:
+                failures.append(one_line(error))
+
+    folder = Path("outputs", "data", name)
+    before = set(folder.glob("sheet*.png"))
+    pages = save_contact_sheet(folder / "sheet.png", loaded(), f"{name}, as prepared")
+    for path in before - set(pages):
+        path.unlink()
+    for path in pages:
+        show(console, f"contact sheet: {path}")
+    if failures:
+        raise ConfigError(f"{len(failures)} of {len(source.scenes())} scenes cannot be read: {'; '.join(failures)}")
+    return []

@@ -12,7 +12,7 @@ from dsr.app.upsample.parts import EXPECTED_ERROR
 from dsr.geometry.lights import FIGURE_LIGHT, LIGHT_CHOICES, LIGHT_NAMES
 from dsr.report.study import Choice
 from dsr.utils.configuration import config_directories, list_choices
-from dsr.utils.options import Options, Rule, at_least, group, one_of, option, positive, some_of
+from dsr.utils.options import Options, Rule, at_least, group, one_of, option, positive
 
 SHELLS = ("bash", "zsh", "fish")
 REPORT_PARTS = ("tables", "metrics", "figures", "page")
@@ -57,7 +57,9 @@ class ReportRequest(RunsRequest):
         "these parts alone, of tables, metrics, figures, page",
         "A,B",
         flags="--only",
-        rule=some_of(REPORT_PARTS),
+        rule=Rule(
+            f"some of {', '.join(REPORT_PARTS)}", lambda part: part in REPORT_PARTS, each=True, known=REPORT_PARTS
+        ),
         parse=lambda text: tuple(part.strip() for part in text.split(",")),
     )
     workers: int | None = option(
@@ -251,7 +253,7 @@ class DataVerifyRequest(Options):
 class DataGetRequest(DataVerifyRequest):
     """Fetch what is missing. Run the same command again to continue an interrupted download."""
 
-    mirror: str | None = option(None, "a server to try first, see below", "URL")
+    mirror: str | None = option(None, "a server to try first, see docs/data.md", "URL")
     yes: bool = option(False, "do not ask", flags="--yes -y")
     keep_archives: bool = option(False, "keep archives after unpacking")
 

@@ -76,12 +76,14 @@ def entries_of(node: Any, above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[s
         yield from entries_of(value, key)
 
 
-def default_directory(kind: str, config: Config, identity: Identity, overrides: Sequence[str] = ()) -> Path:
-    """Return outputs/KIND/NAME for a run with these overrides of the command line.
+def directory_of(kind: str, config: Config, identity: Identity, overrides: Sequence[str] = ()) -> Path:
+    """Return ``output_dir``, or outputs/KIND/NAME for a run with these overrides of the command line.
 
     The first eight digits of the identity's hash follow where an override is too long to be shown, or where the
     directory of that name holds a run of another identity. Weights that were given are named by their hash.
     """
+    if config["output_dir"]:
+        return Path(config["output_dir"]).expanduser()
     head = "method" if kind == "eval" else "model"
     listed: Any = OmegaConf.load(config_directories()[0] / f"{kind}.yaml")
     usual = {group: name for each in listed["defaults"] if not isinstance(each, str) for group, name in each.items()}
@@ -121,7 +123,6 @@ def _setting(key: str, value: str) -> tuple[str, bool]:
 
 
 def _hash_of(identity: Identity) -> str:
-    """Return the hash of an identity."""
     return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
 
 
@@ -178,10 +179,8 @@ def expect_free(folder: Path, config: Config, identity: Identity, tolerated: Seq
         raise ConfigError(f"output_dir: {folder} holds files of something else; another output_dir keeps them")
     changed = [key for key in different if key not in tolerated]
     if changed:
-        raise ConfigError(
-            f"output_dir: {folder} holds a run with another {', '.join(changed)}; "
-            "another output_dir keeps it, overwrite=true replaces it"
-        )
+        cure = "another output_dir keeps it, overwrite=true replaces it"
+        raise ConfigError(f"output_dir: {folder} holds a run with another {', '.join(changed)}; {cure}")
     return different
 
 
@@ -204,19 +203,14 @@ def at_work(
             write_text(folder / _RECORD, json.dumps(record, indent=1) + "\n")
             write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(config))))
         except processes.InUseError as error:
-            others = "" if alone else " with other settings"
-            raise ConfigError(
-                f"output_dir: {error.owner} is at work in {folder}{others}; wait for its end, or take another"
-            ) from error
+            raise ConfigError(f"output_dir: {error}") from error
         except OSError as error:
-            raise ConfigError(
-                f"output_dir: expected a directory to write to, got {folder} ({error.strerror})"
-            ) from error
+            came = f"{folder} ({error.strerror})"
+            raise ConfigError(f"output_dir: expected a directory to write to, got {came}") from error
         yield different
 
 
 def _changes(before: Config, now: Config, prefix: str = "") -> list[str]:
-    """Return the dotted keys whose values differ."""
     changed = []
     for key in sorted(before.keys() | now.keys()):
         old, new = before.get(key), now.get(key)

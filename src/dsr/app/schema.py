@@ -342,17 +342,6 @@ def _present(*names: str) -> str:
     return ",".join(name for name in names if name not in absent)
 
 
-@dataclass(frozen=True)
-class Plan:
-    """The outline of a job of a multirun: directory, identity, and how many scenes or steps are left and done."""
-
-    folder: Path
-    identity: Identity
-    unit: str
-    left: int
-    done: int = 0
-
-
 def runs_here() -> bool:
     """Return whether the launcher of the multirun runs its jobs in this process, and so with its devices."""
     return HydraConfig.get().runtime.choices.get("hydra/launcher") == "basic"

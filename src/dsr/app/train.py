@@ -36,7 +36,6 @@ from dsr.app.schema import (
     READ_OF_TRAINER,
     Config,
     Identity,
-    Plan,
     TrainConfig,
     given_keys,
     given_overrides,
@@ -53,14 +52,21 @@ from dsr.training.data_module import PatchData
 from dsr.training.module import SuperResolution
 from dsr.utils import interruption
 from dsr.utils.arrays import read_torch_file
-from dsr.utils.checkpoints import BestCheckpoint, DivergenceError, Interruption
+from dsr.utils.checkpoints import (
+    BestCheckpoint,
+    DivergenceError,
+    Interruption,
+    ScoreTables,
+    StepProgress,
+    fit,
+    make_trainer,
+    without_chatter,
+)
 from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError, build, expect_library
 from dsr.utils.console import USAGE_ERROR, ConsoleProgress, one_line, without_credentials
 from dsr.utils.files import replacing
 from dsr.utils.guards import did_you_mean
-from dsr.utils.lightning import ScoreTables, StepProgress, fit, make_trainer, without_chatter
-from dsr.utils.progress import Progress
 from dsr.utils.runs_table import list_run
 
 MONITOR = "val/RMSE_v"
@@ -79,18 +85,17 @@ def train(config: DictConfig) -> float:
     plain, settings, device = _read(config)
     processes = find_processes(device, settings.trainer["devices"])
     with processes.running():
-        return _train(_prepare(plain, settings, device, processes))
+        return _Training(plain, settings, device, processes).run()
 
 
-def plan(config: DictConfig) -> list[Plan]:
-    """Check what :func:`train` would do as a job of a multirun; nothing is computed or written."""
+def check(config: DictConfig) -> Iterator[tuple[Path, Identity]]:
+    """Check what :func:`train` would do as a job of a multirun, and write nothing; yield its directory and identity."""
     here = runs_here()
     plain, settings, device = _read(config, here=here)
-    prepared = _prepare(plain, settings, device, find_processes(device, settings.trainer["devices"] if here else 1))
+    prepared = _Training(plain, settings, device, find_processes(device, settings.trainer["devices"] if here else 1))
     elsewhere = () if here else ("device", "precision")
     rundir.expect_free(prepared.folder, plain, prepared.identity, (*prepared.tolerated, *elsewhere))
-    done = settings.steps if (prepared.folder / WEIGHTS).exists() and not settings.overwrite else 0
-    return [Plan(prepared.folder, prepared.identity, "step", settings.steps - done, done)]
+    yield prepared.folder, prepared.identity
 
 
 @dataclass(frozen=True)
@@ -154,11 +159,8 @@ def _read(config: DictConfig, *, here: bool = True) -> tuple[dict[str, Any], Tra
     plain = plain_config(config)
     if plain.get("resume") is not None:
         folder = Path(plain["resume"]).expanduser()
-        others = [key for key in given_keys() if key not in _RESUMABLE]
-        if others:
-            raise ConfigError(
-                f"resume: continues with the run's own configuration; {', '.join(others)} cannot be changed"
-            )
+        if others := ", ".join(key for key in given_keys() if key not in _RESUMABLE):
+            raise ConfigError(f"resume: continues with the run's own configuration; {others} cannot be changed")
         before = read_config(folder, plain["trust"])
         device = {"device": plain["device"]} if "device" in given_keys() else {}
         plain = {**before, **device, "resume": None, "output_dir": str(folder), "overwrite": False, "trust": None}
@@ -169,82 +171,170 @@ def _read(config: DictConfig, *, here: bool = True) -> tuple[dict[str, Any], Tra
     return plain, settings, chosen
 
 
-@dataclass(frozen=True)
-class _Prepared:
+class _Training:
     """A training that can be run, in the directory of its run, of which nothing is written yet."""
 
-    plain: Config
-    settings: TrainConfig
-    data: PatchData
-    module: SuperResolution
-    trainer: lightning.Trainer
-    best: ModelCheckpoint
-    progress: Progress
-    identity: Identity
-    folder: Path
-    resume: Path | None
-    tolerated: tuple[str, ...]
+    def __init__(self, plain: Config, settings: TrainConfig, device: torch.device, processes: Processes) -> None:
+        if settings.seed > _LARGEST_SEED:
+            raise ConfigError(f"seed: expected at most {_LARGEST_SEED}, got {settings.seed}")
+        lightning.seed_everything(settings.seed, workers=True, verbose=False)
+        net = _network(settings)
+        data = training_data(settings, processes.count)
+        if settings.downsampling.get("assumed") is not None:
+            raise ConfigError("downsampling.assumed: a training assumes no downsampling model; leave it out")
+        check_metrics(settings.metrics)
+        module = _module(settings, net, data)
+        identity = rundir.identity_of(plain, None, device)
+        folder = rundir.directory_of("train", plain, identity, given_overrides())
+        progress = ConsoleProgress(Console(quiet=processes.rank > 0))
+        best = BestCheckpoint(folder / _LAST.parent, MONITOR)
+        callbacks = [
+            *_own_callbacks(settings, module),
+            ScoreTables(folder / "validation.csv", best),
+            best,
+            StepProgress(progress, "train"),
+            Interruption(folder / _LAST),
+        ]
+        loggers = []
+        for name, node in settings.logger.items():
+            if name in ("wandb", "mlflow"):  # an extra of that name installs the library
+                expect_library(f"logger={name}", name, name)
+            for key, value in node.items():  # of which the run's config.yaml keeps each
+                if isinstance(value, str) and without_credentials(value) != value:
+                    what = "an address without name and password, which the service reads from the environment"
+                    raise ConfigError(f"logger.{name}.{key}: expected {what}")
+            with without_chatter():
+                loggers.append(build(f"logger.{name}", {"save_dir": str(folder), **node}))
+        ours = READ_OF_TRAINER.keys() - {"gradient_clip_val"}  # the limit of gradients is only checked here
+        unused = "_find_unused_parameters_true" if settings.degradation.get("scales") else ""  # layers of one factor
+        trainer = make_trainer(
+            device,
+            settings.steps,
+            settings.interval,
+            callbacks=callbacks,
+            node={key: value for key, value in settings.trainer.items() if key not in ours},
+            logger=loggers,
+            devices=processes.count,
+            accumulate=settings.accumulate,
+            environment=processes.environment,
+            strategy=f"ddp{unused}" if processes.count > 1 else "auto",
+            precision="bf16-mixed" if settings.precision == "bfloat16" else "32-true",
+            default_root_dir=folder,
+        )
+        self.tolerated = (
+            ("results_version", "scenes_version", "outside_code", "device") if "resume" in given_keys() else ()
+        )
+        self.resume = folder / _LAST if (folder / _LAST).is_file() and not settings.overwrite else None
+        self.plain, self.settings, self.identity, self.folder = plain, settings, identity, folder
+        self.data, self.module, self.trainer, self.best, self.progress = data, module, trainer, best, progress
 
+    def run(self) -> float:
+        """Train in one of the processes, the first of which has the directory for itself; return the best score."""
+        settings, folder, data, module, trainer = self.settings, self.folder, self.data, self.module, self.trainer
+        if trainer.is_global_zero:
+            rundir.expect_free(folder, self.plain, self.identity, self.tolerated)
+            if (folder / WEIGHTS).exists() and not settings.overwrite:
+                raise ConfigError(f"output_dir: {folder / WEIGHTS} is trained already; overwrite=true trains it again")
+        held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.held_out.items())
+        count, parameters = (
+            sum(len(names) for _, names in data.trained),
+            sum(p.numel() for p in module.net.parameters()),
+        )
+        patch, several = data.patches.patch, f" x {settings.accumulate} batches" if settings.accumulate > 1 else ""
+        several += f" x {trainer.world_size} devices" if trainer.world_size > 1 else ""
+        logs = (f"tensorboard --logdir {folder}" if name == "tensorboard" else name for name in settings.logger)
+        for line in (
+            f"model  {settings.names['model']} x{settings.scale}, {parameters:,} parameters, {settings.precision}",
+            f"data   {count} scenes of {settings.names['dataset']} to train on, {held_out} to validate with",
+            f"steps  {settings.steps} of {data.patches.batch} patches of {patch} x {patch}{several}"
+            f"{', resumed' if self.resume else ''}",
+            f"log    {', '.join(logs)}",
+        ):
+            self.progress.say(line)
+        for source, names in (*data.trained, *data.held_out.values()):
+            prepare_scenes(source, names, self.progress)
+        with keyed():
+            data.setup()
+            module.objective = module.objective.balanced(data.first_patches)  # its weights may depend on the scenes
+        self.progress.say(f"loss   {module.objective.formula}")
+        if not trainer.is_global_zero:
+            return self._fit()
+        with rundir.at_work(folder, self.plain, self.identity, self.tolerated, alone=True) as changed:
+            for key in changed:
+                self.progress.say(f"note: the run began with another {key}")
+            if (
+                settings.overwrite
+            ):  # so that nothing of the earlier training is taken for this one's if it is interrupted
+                (folder / WEIGHTS).unlink(missing_ok=True)
+                for name in ("checkpoints", "tensorboard", "csv", "wandb"):
+                    shutil.rmtree(folder / name, ignore_errors=True)
+            return self._fit()
 
-def _prepare(plain: Config, settings: TrainConfig, device: torch.device, processes: Processes) -> _Prepared:
-    """Check and build all that a training needs, and write nothing."""
-    if settings.seed > _LARGEST_SEED:
-        raise ConfigError(f"seed: expected at most {_LARGEST_SEED}, got {settings.seed}")
-    lightning.seed_everything(settings.seed, workers=True, verbose=False)
-    net = _network(settings)
-    data = training_data(settings, processes.count)
-    if settings.downsampling.get("assumed") is not None:
-        raise ConfigError("downsampling.assumed: a training assumes no downsampling model; leave it out")
-    check_metrics(settings.metrics)
-    module = _module(settings, net, data)
-    identity = rundir.identity_of(plain, None, device)
-    folder = Path(
-        settings.output_dir or rundir.default_directory("train", plain, identity, given_overrides())
-    ).expanduser()
-    progress = ConsoleProgress(Console(quiet=processes.rank > 0))
-    best = BestCheckpoint(folder / _LAST.parent, MONITOR)
-    callbacks = [
-        *_own_callbacks(settings, module),
-        ScoreTables(folder / "validation.csv", best),
-        best,
-        StepProgress(progress, "train"),
-        Interruption(folder / _LAST),
-    ]
-    loggers = []
-    for name, node in settings.logger.items():
-        if name in ("wandb", "mlflow"):  # an extra of that name installs the library
-            expect_library(f"logger={name}", name, name)
-        for key, value in node.items():
-            if isinstance(value, str) and without_credentials(value) != value:
-                raise ConfigError(
-                    f"logger.{name}.{key}: expected an address without name and password, which the run's config.yaml "
-                    "would keep; the service reads them from the environment"
+    def _fit(self) -> float:
+        """Train in the directory of the run; return the score of the weights that are kept."""
+        plain, settings, folder, trainer = self.plain, self.settings, self.folder, self.trainer
+        groups = ("model", "dataset", "downsampling", "noise", "degradation", "trainer")
+        facts = {
+            **{group: plain["names"][group] for group in groups},
+            **{key: plain[key] for key in ("scale", "seed", "precision")},
+            "steps": settings.steps,
+            "learning_rate": settings.model.get("optimizer", {}).get("lr"),
+            **{key: getattr(self.data.patches, key) for key in ("batch", "patch")},
+            **self.module.objective.facts,
+        }
+        if trainer.is_global_zero:
+            self._log(facts)
+        try:
+            fit(trainer, self.module, self.data, self.resume)
+        except DivergenceError as error:
+            raise ConfigError(
+                f"{folder}: the training {error}; checkpoints of earlier steps are kept; a lower model.optimizer.lr or "
+                "trainer.gradient_clip_val, or a longer model.scheduler.warmup, may help, with overwrite=true"
+            ) from error
+        except MisconfigurationException as error:
+            raise ConfigError(f"trainer, callbacks: {one_line(error)}") from error
+        except KeyboardInterrupt:
+            message = f"interrupted at step {trainer.global_step}; resume={folder} continues from there"
+            raise KeyboardInterrupt(message) from None
+        finally:
+            client: Any = sys.modules.get("wandb")
+            if getattr(client, "run", None) is not None:
+                client.finish()  # so that the next job of a multirun has a run of its own
+        if trainer.fast_dev_run:  # type: ignore[attr-defined]
+            return math.nan
+        if trainer.is_global_zero:
+            kept = folder / _LAST.with_name(f"{settings.keep}.ckpt")
+            checkpoint = read_torch_file(kept)
+            state, prefix = checkpoint["state_dict"], "average."
+            self.module.average.load_state_dict(
+                {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
+            )
+            with replacing(folder / WEIGHTS) as temporary:
+                save_network(
+                    temporary, self.module.average, facts["model"], {**facts, "steps": checkpoint["global_step"]}
                 )
-        with without_chatter():
-            loggers.append(build(f"logger.{name}", {"save_dir": str(folder), **node}))
-    ours = READ_OF_TRAINER.keys() - {"gradient_clip_val"}  # the limit of gradients is only checked here
-    unused = "_find_unused_parameters_true" if settings.degradation.get("scales") else ""  # layers of one factor
-    trainer = make_trainer(
-        device,
-        settings.steps,
-        settings.interval,
-        callbacks=callbacks,
-        node={key: value for key, value in settings.trainer.items() if key not in ours},
-        logger=loggers,
-        devices=processes.count,
-        accumulate=settings.accumulate,
-        environment=processes.environment,
-        strategy=f"ddp{unused}" if processes.count > 1 else "auto",
-        precision="bf16-mixed" if settings.precision == "bfloat16" else "32-true",
-        default_root_dir=folder,
-    )
-    tolerated = ("results_version", "scenes_version", "outside_code", "device") if "resume" in given_keys() else ()
-    resume = folder / _LAST if (folder / _LAST).is_file() and not settings.overwrite else None
-    return _Prepared(plain, settings, data, module, trainer, best, progress, identity, folder, resume, tolerated)
+        self.progress.say(f"weights: {folder / WEIGHTS}")
+        score = self.best.best_model_score if settings.keep == "best" else trainer.callback_metrics.get(MONITOR)
+        return math.nan if score is None else float(score)
+
+    def _log(self, facts: Mapping[str, Any]) -> None:
+        """Log the configuration before there are values: TensorBoard gets its main settings and a layout of charts."""
+        plain = self.plain
+        metrics: Any = self.module.metrics[0]
+        table = {**facts, "method": facts["model"], "degradation": rundir.degradation_of(plain)}
+        for logger in self.trainer.loggers:
+            if isinstance(logger, TensorBoardLogger):
+                logger.experiment.add_text("config", f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(dict(plain)))}```")
+                logger.experiment.flush()
+                log_layout(logger, {name: metric.chart_title for name, metric in metrics.items()})
+                logger.log_hyperparams(table)
+                list_run(logger.experiment, "training", table, {})
+            elif self.resume is None:  # MLflow refuses another device, say
+                loss = {**plain["loss"], "w": facts["w"]} if "w" in facts else {}
+                logger.log_hyperparams({**plain, "loss": loss})
 
 
 def _network(settings: TrainConfig) -> DisparityNetwork:
-    """Build the network, with initial weights if they are given."""
     net: DisparityNetwork = build("model.net", settings.model["net"])
     for key, take in (("weights", net.start_from), ("shared", net.share)):
         given = getattr(settings.start, key)
@@ -260,9 +350,8 @@ def _network(settings: TrainConfig) -> DisparityNetwork:
             raise ConfigError(f"start.{key}: {given}: {error}") from error
     for scale in settings.degradation.get("scales") or ():
         if not net.serves(settings.scale, int(scale)):
-            raise ConfigError(
-                f"degradation.scales: expected factors that weights for {settings.scale} serve, got {scale}"
-            )
+            expected = f"factors that weights for {settings.scale} serve"
+            raise ConfigError(f"degradation.scales: expected {expected}, got {scale}")
     for pattern in settings.start.frozen:
         found = [value for name, value in net.named_parameters() if fnmatch.fnmatchcase(name, pattern)]
         if not found:
@@ -296,7 +385,6 @@ def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData) -> Su
 
 
 def _own_callbacks(settings: TrainConfig, module: SuperResolution) -> list[Callback]:
-    """Build the callbacks of the configuration."""
     scored: Any = module.metrics[0]
     kinds = ["val", *(f"{kind}_{each}" for kind in ("val", "bicubic") for each in module.sets), "bicubic"]
     known = [f"{kind}/{name}" for kind in kinds for name in scored]
@@ -305,119 +393,15 @@ def _own_callbacks(settings: TrainConfig, module: SuperResolution) -> list[Callb
         each = build(f"callbacks.{name}", node)
         monitor = getattr(each, "monitor", None)
         if monitor is not None and not monitor.startswith("train/") and monitor not in known:
+            expected = f"one of {', '.join(known[: len(scored)])}"
             near = did_you_mean(monitor, known)
-            raise ConfigError(
-                f"callbacks.{name}.monitor: expected one of {', '.join(known[: len(scored)])}, got {monitor}{near}"
-            )
+            raise ConfigError(f"callbacks.{name}.monitor: expected {expected}, got {monitor}{near}")
         if isinstance(each, LearningRateMonitor) and not settings.logger:
             raise ConfigError(f"callbacks.{name}: expected a logger to write to, such as logger=csv, got none")
         if isinstance(each, ProgressBar | GradientAccumulationScheduler):
-            raise ConfigError(
-                f"callbacks.{name}: expected none that shows progress, which dsr does, or accumulates batches, which "
-                "trainer.accumulate_grad_batches does; leave it out"
-            )
+            what = "shows progress, which dsr does, or accumulates batches, which trainer.accumulate_grad_batches does"
+            raise ConfigError(f"callbacks.{name}: expected none that {what}; leave it out")
         if isinstance(each, ModelCheckpoint):  # whose keys would be alike
             each.__class__ = type(type(each).__name__, (type(each),), {"state_key": f"callbacks.{name}"})
         own.append(each)
     return own
-
-
-def _train(prepared: _Prepared) -> float:
-    """Train in one of the processes, the first of which has the directory for itself, and return the best score."""
-    plain, settings, folder = prepared.plain, prepared.settings, prepared.folder
-    data, module, trainer = prepared.data, prepared.module, prepared.trainer
-    if trainer.is_global_zero:
-        rundir.expect_free(folder, plain, prepared.identity, prepared.tolerated)
-        if (folder / WEIGHTS).exists() and not settings.overwrite:
-            raise ConfigError(f"output_dir: {folder / WEIGHTS} is trained already; overwrite=true trains it again")
-    held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.held_out.items())
-    count, parameters = sum(len(names) for _, names in data.trained), sum(p.numel() for p in module.net.parameters())
-    patch, several = data.patches.patch, f" x {settings.accumulate} batches" if settings.accumulate > 1 else ""
-    several += f" x {trainer.world_size} devices" if trainer.world_size > 1 else ""
-    logs = (f"tensorboard --logdir {folder}" if name == "tensorboard" else name for name in settings.logger)
-    for line in (
-        f"model  {settings.names['model']} x{settings.scale}, {parameters:,} parameters, {settings.precision}",
-        f"data   {count} scenes of {settings.names['dataset']} to train on, {held_out} to validate with",
-        f"steps  {settings.steps} of {data.patches.batch} patches of {patch} x {patch}{several}"
-        f"{', resumed' if prepared.resume else ''}",
-        f"log    {', '.join(logs)}",
-    ):
-        prepared.progress.say(line)
-    for source, names in (*data.trained, *data.held_out.values()):
-        prepare_scenes(source, names, prepared.progress)
-    with keyed():
-        data.setup()
-        module.objective = module.objective.balanced(data.first_patches)  # its weights may depend on the scenes
-    prepared.progress.say(f"loss   {module.objective.formula}")
-    if not trainer.is_global_zero:
-        return _fit(prepared)
-    with rundir.at_work(folder, plain, prepared.identity, prepared.tolerated, alone=True) as changed:
-        for key in changed:
-            prepared.progress.say(f"note: the run began with another {key}")
-        if settings.overwrite:  # so that nothing of the earlier training is taken for this one's if it is interrupted
-            (folder / WEIGHTS).unlink(missing_ok=True)
-            for name in ("checkpoints", "tensorboard", "csv", "wandb"):
-                shutil.rmtree(folder / name, ignore_errors=True)
-        return _fit(prepared)
-
-
-def _fit(prepared: _Prepared) -> float:
-    """Train in the directory of the run; return the score of the weights that are kept."""
-    plain, settings, folder = prepared.plain, prepared.settings, prepared.folder
-    data, module, trainer = prepared.data, prepared.module, prepared.trainer
-    groups = ("model", "dataset", "downsampling", "noise", "degradation", "trainer")
-    facts = {
-        **{group: plain["names"][group] for group in groups},
-        **{key: plain[key] for key in ("scale", "seed", "precision")},
-        "steps": settings.steps,
-        "learning_rate": settings.model.get("optimizer", {}).get("lr"),
-        **{key: getattr(data.patches, key) for key in ("batch", "patch")},
-        **module.objective.facts,
-    }
-    if trainer.is_global_zero:
-        _log_settings(prepared, facts)
-    try:
-        fit(trainer, module, data, prepared.resume)
-    except DivergenceError as error:
-        raise ConfigError(
-            f"{folder}: the training {error}; checkpoints of earlier steps are kept; a lower model.optimizer.lr or "
-            "trainer.gradient_clip_val, or a longer model.scheduler.warmup, may help, with overwrite=true"
-        ) from error
-    except MisconfigurationException as error:
-        raise ConfigError(f"trainer, callbacks: {one_line(error)}") from error
-    except KeyboardInterrupt:
-        message = f"interrupted at step {trainer.global_step}; resume={folder} continues from there"
-        raise KeyboardInterrupt(message) from None
-    finally:
-        client: Any = sys.modules.get("wandb")
-        if getattr(client, "run", None) is not None:
-            client.finish()  # so that the next job of a multirun has a run of its own
-    if trainer.fast_dev_run:  # type: ignore[attr-defined]
-        return math.nan
-    if trainer.is_global_zero:
-        kept = folder / _LAST.with_name(f"{settings.keep}.ckpt")
-        checkpoint = read_torch_file(kept)
-        state, prefix = checkpoint["state_dict"], "average."
-        module.average.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
-        with replacing(folder / WEIGHTS) as temporary:
-            save_network(temporary, module.average, facts["model"], {**facts, "steps": checkpoint["global_step"]})
-    prepared.progress.say(f"weights: {folder / WEIGHTS}")
-    score = prepared.best.best_model_score if settings.keep == "best" else trainer.callback_metrics.get(MONITOR)
-    return math.nan if score is None else float(score)
-
-
-def _log_settings(prepared: _Prepared, facts: Mapping[str, Any]) -> None:
-    """Log a run's configuration before it has values: TensorBoard gets its main settings and a layout of its charts."""
-    plain = prepared.plain
-    metrics: Any = prepared.module.metrics[0]
-    table = {**facts, "method": facts["model"], "degradation": rundir.degradation_of(plain)}
-    for logger in prepared.trainer.loggers:
-        if isinstance(logger, TensorBoardLogger):
-            logger.experiment.add_text("config", f"```yaml\n{OmegaConf.to_yaml(OmegaConf.create(dict(plain)))}```")
-            logger.experiment.flush()
-            log_layout(logger, {name: metric.chart_title for name, metric in metrics.items()})
-            logger.log_hyperparams(table)
-            list_run(logger.experiment, "training", table, {})
-        elif prepared.resume is None:  # MLflow refuses another device, say
-            loss = {**plain["loss"], "w": facts["w"]} if "w" in facts else {}
-            logger.log_hyperparams({**plain, "loss": loss})

@@ -206,7 +206,6 @@ def keyed() -> Iterator[None]:
 
 
 def _parts(settings: TrainConfig) -> list[Part]:
-    """Build the data sets to train on, with their fractions."""
     node = settings.dataset
     if "parts" not in node:
         return [Part(settings.build("dataset"))]

@@ -16,7 +16,7 @@ from dsr.app.requests import SHELLS, CompletionRequest
 from dsr.cli import Parser, make_parser
 from dsr.data.download import CATALOGUE
 from dsr.geometry.lights import LIGHT_NAMES
-from dsr.utils.configuration import config_directories, list_choices, list_groups
+from dsr.utils.configuration import config_directories, list_choices
 
 _SCRIPTS = {
     "bash": """\
@@ -76,7 +76,6 @@ def words_at_end(parser: Parser, line: str) -> list[str]:
 
 
 def _names_of(action: argparse.Action) -> list[str]:
-    """Return the known names that may stand for a value."""
     return [str(name) for name in action.choices or _NAMES.get(action.dest, tuple)()]
 
 
@@ -86,12 +85,11 @@ def _overrides(last: str) -> list[str]:
     key, equals, _ = last.partition("=")
     if equals:
         return [f"{key}={choice}" for choice in list_choices(key.lstrip("+"), directories)]
-    groups = [f"{group}=" for group in list_groups(directories)]
-    return [f"+{each}" if each == "experiment=" else each for each in groups] + [*_HYDRA_FLAGS]
+    groups = sorted(path.name for path in directories[0].iterdir() if path.is_dir())
+    return [f"+{each}=" if each == "experiment" else f"{each}=" for each in groups] + [*_HYDRA_FLAGS]
 
 
 def _split(line: str) -> list[str]:
-    """Return the words of a line, of which the last one may be empty."""
     words = line.split()
     with contextlib.suppress(ValueError):  # a quote that is not closed yet
         words = shlex.split(line)

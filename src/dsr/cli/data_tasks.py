@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, metadata
 
 from rich.console import Console
+from rich.prompt import Confirm
 from rich.table import Table
 
 from dsr.app.requests import (
@@ -60,12 +61,12 @@ def _weights(names: list[str]) -> Collection:
     )
 
 
-def list_data_sets(_: DataListRequest, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
+def list_data_sets(_: DataListRequest, console: Console) -> list[str]:
     """Show a table of the data sets."""
     table = Table(box=None, pad_edge=False)
     for header in ("name", "what", "about", "here", "checksums"):
         table.add_column(header, overflow="fold", no_wrap=header != "what")
-    for collection in catalogue.values():
+    for collection in downloads().values():
         size = "" if collection.size is None else megabytes(collection.size)
         here, known = state(collection, data_root()), checksums_of(collection, data_root())
         table.add_row(collection.name, collection.title, size, here, known)
@@ -73,21 +74,21 @@ def list_data_sets(_: DataListRequest, console: Console, catalogue: Mapping[str,
     return []
 
 
-def show_folders(request: DataWhereRequest, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
+def show_folders(request: DataWhereRequest, console: Console) -> list[str]:
     """Show the directory of the data sets, and their folders."""
-    collections = find(request.names, catalogue)
+    collections = find(request.names, downloads())
     if not collections:
         show(console, str(data_root().absolute()))
-    for collection in collections or catalogue.values():
+    for collection in collections or downloads().values():
         for folder in collection.folders:
             path = (data_root() / folder).absolute()
             show(console, str(path) if collections else f"  {collection.name:<17} {path}")
     return []
 
 
-def get_data_sets(request: DataGetRequest, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
+def get_data_sets(request: DataGetRequest, console: Console) -> list[str]:
     """Show what will be downloaded and its licence, ask for confirmation on a terminal, and download it."""
-    collections = find(request.names, catalogue)
+    collections = find(request.names, downloads())
     if request.mirror is not None:
         expect_address(request.mirror)  # before anything is shown
     root, progress = data_root(), ConsoleProgress(console)
@@ -97,7 +98,8 @@ def get_data_sets(request: DataGetRequest, console: Console, catalogue: Mapping[
         _describe(collection, console)
     if items:
         show(console, f"{missing} of {len(items)} files are missing in {root.absolute()}")
-    if missing and not request.yes and sys.stdin.isatty() and console.is_terminal and not _agreed(console):
+    asks = missing and not request.yes and sys.stdin.isatty() and console.is_terminal
+    if asks and not Confirm.ask("fetch them?", console=console, default=True):
         return []
     problems = []
     if items:
@@ -111,7 +113,6 @@ def get_data_sets(request: DataGetRequest, console: Console, catalogue: Mapping[
 
 
 def _describe(collection: Collection, console: Console) -> None:
-    """Show a collection's title, size, page, licence and citation."""
     size = "" if collection.size is None else f", about {megabytes(collection.size)}"
     show(console, f"{collection.name}: {collection.title}{size}")
     for key, text in (("page", collection.homepage), ("licence", collection.licence), ("cite", collection.citation)):
@@ -120,20 +121,10 @@ def _describe(collection: Collection, console: Console) -> None:
             show(console, f"  {'' if number else key:<9} {line}")
 
 
-def _agreed(console: Console) -> bool:
-    """Ask for confirmation, and return whether the user agrees."""
-    console.print("fetch them? [Y/n] ", markup=False, highlight=False, end="")
-    try:
-        answer = console.input()
-    except EOFError:
-        return False
-    return answer.strip().lower() in ("", "y", "yes")
-
-
-def verify_data_sets(request: DataVerifyRequest, console: Console, catalogue: Mapping[str, Collection]) -> list[str]:
+def verify_data_sets(request: DataVerifyRequest, console: Console) -> list[str]:
     """Check collections, and show which are complete."""
     problems, progress = [], ConsoleProgress(console)
-    for collection in find(request.names, catalogue):
+    for collection in find(request.names, downloads()):
         found = verify(collection, data_root(), progress)
         if not found:
             show(console, f"{collection.name}: complete, as recorded")

@@ -7,7 +7,6 @@ import os
 import platform
 import shutil
 import tempfile
-import webbrowser
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, distribution, distributions
 from pathlib import Path
@@ -18,8 +17,7 @@ from packaging.specifiers import SpecifierSet
 from rich.text import Text
 
 from dsr.data.download import CATALOGUE
-from dsr.doctor.about import graphics_cards, processor, version_lines
-from dsr.doctor.findings import FINE, Finding, Level, show_findings
+from dsr.doctor import Finding, Level, graphics_cards, processor, show_findings, version_lines
 from dsr.methods import weights
 from dsr.synthetic import cache_directory
 from dsr.utils.compute_device import fast_precision, pick_device
@@ -30,18 +28,6 @@ from dsr.utils.versions import DISTRIBUTION, file_hash, how_to_install
 
 _OPENCV = "opencv-python-headless"
 _LITTLE = 1 << 30  # free bytes of a disk below which results of large photos may not fit
-EXTRAS = {
-    "app": "`dsr app`, a page of this machine that upsamples what is dropped on it",
-    "captures": "recordings of cameras and apps, HEIC photos",
-    "cluster": "`-m` on Slurm and in several processes",
-    "mesh": "`dsr upsample` simplifies large meshes with more detail",
-    "mlflow": "trainings logged to MLflow",
-    "onnx": "`dsr export`, method=onnx and monocular",
-    "rerun": "`dsr upsample --with rerun`",
-    "transformers": "method=prompt_da",
-    "wandb": "trainings logged to Weights & Biases",
-}
-"""What each extra of pyproject.toml is for, without those of contributors."""
 
 
 def examine_machine() -> int:
@@ -51,7 +37,7 @@ def examine_machine() -> int:
     missing = [each for each in findings if each.level == "problem"]
     if not missing:
         console.print("everything that dsr upsample needs is here", style="bold", highlight=False)
-        return FINE
+        return 0
     advice = "; ".join(dict.fromkeys(each.advice for each in missing))
     console.print(Text(f"dsr upsample needs: {advice}", "bold red"), soft_wrap=True)
     return USAGE_ERROR
@@ -117,18 +103,17 @@ def check_device() -> list[Finding]:
         device = pick_device("auto")
     except ValueError as error:
         return [Finding("device", "problem", one_line(error), "unset DSR_DEVICE, or correct it")]
-    threads = f"{torch.get_num_threads()} threads, {os.cpu_count()} processors"
-    threads += ", OMP_NUM_THREADS={OMP_NUM_THREADS}".format_map(os.environ) if "OMP_NUM_THREADS" in os.environ else ""
-    found = [Finding("threads", "ok", threads)]
+    level: Level = "ok"
+    message, advice = f"{processor()}, {fast_precision(device)}; no graphics card is needed", ""
     if device.type == "cuda":
         memory = megabytes(torch.cuda.get_device_properties(device).total_memory)
         message = f"{torch.cuda.get_device_name(device)}, {memory}, {fast_precision(device)}"
-        return [Finding("device", "ok", message), *found]
-    cards = graphics_cards()
-    if cards and not torch.cuda.is_available():
-        message = f"{', '.join(cards)}, which torch {torch.__version__} cannot use"
-        return [Finding("device", "warning", message, "install torch for CUDA, see pytorch.org/get-started"), *found]
-    return [Finding("device", "ok", f"{processor()}, {fast_precision(device)}; no graphics card is needed"), *found]
+    elif not torch.cuda.is_available() and (cards := graphics_cards()):
+        message, level = f"{', '.join(cards)}, which torch {torch.__version__} cannot use", "warning"
+        advice = "install torch for CUDA, see pytorch.org/get-started"
+    threads = f"{torch.get_num_threads()} threads, {os.cpu_count()} processors"
+    threads += ", OMP_NUM_THREADS={OMP_NUM_THREADS}".format_map(os.environ) if "OMP_NUM_THREADS" in os.environ else ""
+    return [Finding("device", level, message, advice), Finding("threads", "ok", threads)]
 
 
 def check_folders() -> list[Finding]:
@@ -155,26 +140,16 @@ def _folder(name: str, path: Path) -> Finding:
     return Finding(name, "ok", message)
 
 
-def check_browser() -> list[Finding]:
-    """Say whether there is a browser, which opens the pages of `dsr view`."""
-    try:
-        return [Finding("browser", "ok", webbrowser.get().__class__.__name__)]
-    except webbrowser.Error:
-        return [Finding("browser", "note", "none; `dsr view --no-open` writes a page to open elsewhere")]
-
-
 def check_extras() -> list[Finding]:
-    """List the extras for users: which are there, and how to get the others."""
+    """List the extras for users, see docs/index.md: which are there, and how to get the others."""
     findings = []
     with contextlib.suppress(PackageNotFoundError):
         declared = distribution(DISTRIBUTION).metadata.get_all("Provides-Extra") or []
         for name in sorted(set(declared) - {"dev", "docs"}):
-            text = f"{name}: {EXTRAS.get(name, '')}"
             missing = [lacking for each in requirements(name) if (lacking := lack(each)) is not None]
-            if missing:
-                findings.append(Finding("extra", "note", f"{text} ({', '.join(missing)})", how_to_install(name)))
-            else:
-                findings.append(Finding("extra", "ok", text))
+            advice = how_to_install(name) if missing else ""
+            text = f"{name} ({', '.join(missing)})" if missing else name
+            findings.append(Finding("extra", "note" if missing else "ok", text, advice))
     return findings
 
 
@@ -199,6 +174,6 @@ def lack(requirement: Requirement) -> str | None:
 
 
 CHECKS: tuple[Callable[[], list[Finding]], ...] = (
-    check_python, check_packages, check_weights, check_opencv, check_device, check_folders, check_browser, check_extras,
+    check_python, check_packages, check_weights, check_opencv, check_device, check_folders, check_extras,
 )  # fmt: skip
 """A ``problem`` of these affects ``dsr upsample``, a ``note`` does not."""

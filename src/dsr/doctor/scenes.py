@@ -22,7 +22,7 @@ from scipy import ndimage
 from torch.nn import functional
 
 from dsr.data.detection import find_scenes
-from dsr.doctor.findings import FAULTY, FINE, Finding, Level, show_findings, worst
+from dsr.doctor import Finding, Level, show_findings
 from dsr.geometry.agreement import judge
 from dsr.geometry.camera import baseline_times_focal
 from dsr.geometry.planes import range_votes
@@ -109,14 +109,13 @@ def examine_directory(folder: Path, most: int | None = None) -> int:
         else:
             title += "" if scene.depth is not None else f" (the map measured at x{round_ratio(min(scene.measured))})"
             findings = examine(scene)
-        show_findings(console, title, findings, brief=len(scenes) > _MANY_SCENES)
-        verdicts[worst(findings)] += 1
+        verdicts[show_findings(console, title, findings, brief=len(scenes) > _MANY_SCENES)] += 1
     fine = verdicts["ok"] + verdicts["note"]
     parts = [f"{fine} fine"] if fine else []
     parts += [f"{verdicts[level]} with {level}s" for level in ("warning", "problem") if verdicts[level]]
     text = f"{len(scenes)} scene{'s' if len(scenes) > 1 else ''}: {', '.join(parts)}"
     console.print(text, style="bold", highlight=False)
-    return FAULTY if verdicts["warning"] or verdicts["problem"] else FINE
+    return 1 if fine < len(scenes) else 0
 
 
 def examine(scene: Scene) -> list[Finding]:
@@ -138,9 +137,8 @@ def with_depth(scene: Scene) -> Scene:
 
 
 def metres(scene: Scene) -> Array:
-    """Return a scene's high-resolution depth, (H, W) float64 in metres, NaN in holes."""
-    if scene.depth is None:
-        raise ValueError(f"{scene.name}: expected high-resolution depth, there is none; see with_depth")
+    """Return the depth of a scene :func:`with_depth`, (H, W) float64 in metres, NaN in holes."""
+    assert scene.depth is not None  # noqa: S101 - as said
     depth: Array = scene.depth[0].double().numpy()
     return depth
 
@@ -160,7 +158,13 @@ def check_units(scene: Scene) -> list[Finding]:
     elif middle > _FAR:
         level, remark = "note", ": too far for a room, plausible outdoors"
     findings = [Finding("units", level, text + remark, "" if level == "ok" else _advise(scene, middle))]
-    return findings + _baseline(scene) + _measured(scene, depth)
+    baseline = scene.camera.baseline
+    if baseline is not None and not plausible_baseline(baseline):
+        usual = " to ".join(show_length(LIMITS[code]) for code in ("baseline-short", "baseline-long"))
+        advice = 'check "baseline_unit" in camera.json; keep it if depth computed from it is plausible'
+        message = f"baseline {show_length(baseline)}; {usual} are usual"
+        findings.append(Finding("units", "note", message, advice))
+    return findings + _measured(scene, depth)
 
 
 def _advise(scene: Scene, middle: float) -> str:
@@ -178,17 +182,6 @@ def _advise(scene: Scene, middle: float) -> str:
     return f"{', or '.join(texts)}; {where}"
 
 
-def _baseline(scene: Scene) -> list[Finding]:
-    """Check whether the baseline is plausible."""
-    baseline = scene.camera.baseline
-    if baseline is None or plausible_baseline(baseline):
-        return []
-    low, high = (show_length(LIMITS[code]) for code in ("baseline-short", "baseline-long"))
-    message = f"baseline {show_length(baseline)}; {low} to {high} are usual"
-    advice = 'check "baseline_unit" in camera.json; keep it if depth computed from it is plausible'
-    return [Finding("units", "note", message, advice)]
-
-
 def _measured(scene: Scene, depth: Array) -> list[Finding]:
     """Check the measured low-resolution maps against the high-resolution depth."""
     findings = []
@@ -204,9 +197,8 @@ def _measured(scene: Scene, depth: Array) -> list[Finding]:
             continue
         ratio = float(np.median(depth_lr[both] / subsampled[both]))
         if not 1 / _AGREEMENT <= ratio <= _AGREEMENT:
-            message = (
-                f"the measured map at x{round_ratio(factor)} is {ratio:.3g} times as far as the high-resolution depth"
-            )
+            which = f"the measured map at x{round_ratio(factor)}"
+            message = f"{which} is {ratio:.3g} times as far as the high-resolution depth"
             advice = "use one unit for both; the disparity of a low-resolution map is in its own pixels"
             findings.append(Finding("units", "problem", message, advice))
     return findings
@@ -214,11 +206,9 @@ def _measured(scene: Scene, depth: Array) -> list[Finding]:
 
 def check_intrinsics(scene: Scene) -> list[Finding]:
     """Check the camera against the image."""
-    found = judge_camera(scene.camera)
-    if found:
-        return [Finding("intrinsics", each.level, each.message, each.advice) for each in found]
-    view, offset = view_of(scene.camera), offset_of(scene.camera)
-    return [Finding("intrinsics", "ok", f"{view:.0f} degrees across, principal point {offset:.1%} off the centre")]
+    text = f"{view_of(scene.camera):.0f} degrees across, principal point {offset_of(scene.camera):.1%} off the centre"
+    found = [Finding("intrinsics", each.level, each.message, each.advice) for each in judge_camera(scene.camera)]
+    return found or [Finding("intrinsics", "ok", text)]
 
 
 def check_registration(scene: Scene) -> list[Finding]:
@@ -255,16 +245,12 @@ def check_holes(scene: Scene) -> list[Finding]:
     """Check the fraction of missing pixels, and whether a depth value seems to mark missing pixels."""
     depth = metres(scene)
     missing = float(np.isnan(depth).mean())
-    text = f"{1 - missing:.1%} of the pixels are valid"
-    level: Level
-    if missing > _MOST:
-        level = "warning"
-        advice = "results are unreliable where most depth is missing; inpaint the holes, or crop to the valid part"
-    elif missing > _MANY:
-        level, advice = "note", "scores ignore holes"
-    else:
-        level, advice = "ok", ""
-    return [Finding("holes", level, text, advice), *_marks(scene, depth)]
+    level: Level = "warning" if missing > _MOST else "note" if missing > _MANY else "ok"
+    advice = {
+        "warning": "results are unreliable where most depth is missing; inpaint the holes, or crop to the valid part",
+        "note": "scores ignore holes",
+    }.get(level, "")
+    return [Finding("holes", level, f"{1 - missing:.1%} of the pixels are valid", advice), *_marks(scene, depth)]
 
 
 def _marks(scene: Scene, depth: Array) -> list[Finding]:
@@ -287,7 +273,6 @@ def _marks(scene: Scene, depth: Array) -> list[Finding]:
 
 
 def _judge(where: np.ndarray, value: float, beside: float, fraction: float) -> list[Finding]:
-    """Return a finding if an extreme value that many pixels have is, or may be, a mark."""
     smallest = value < beside
     apart = max(value, beside) / min(value, beside) > _GAP
     mark = value < _TINY if smallest else bool(np.isclose(value, _MARKS, rtol=1e-5, atol=0).any())

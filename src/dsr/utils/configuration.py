@@ -57,7 +57,6 @@ def build(group: str, node: Any, given: Mapping[str, Any] | None = None, name: s
 
 
 def _make(group: str, node: Node, given: Mapping[str, Any], name: str | None = None) -> Any:
-    """Build the object, or the partial, that a node describes."""
     target, arguments = _checked(group, node, given, name)
     arguments = {key: _built(f"{group}.{key}", value) for key, value in arguments.items()}
     if node.get(_PARTIAL):
@@ -171,9 +170,3 @@ def config_directories(more: Sequence[Path] = ()) -> tuple[Path, ...]:
 def list_choices(group: str, directories: Sequence[Path]) -> list[str]:
     """Return the sorted names of the files of a group, such as ``method``, in all directories."""
     return sorted({path.stem for directory in directories for path in (directory / group).glob("*.yaml")})
-
-
-def list_groups(directories: Sequence[Path]) -> list[str]:
-    """Return the sorted names of the groups in all directories, without those of Hydra's own settings."""
-    names = {path.name for directory in directories for path in directory.iterdir() if path.is_dir()}
-    return sorted(names - {"hydra"})

@@ -187,7 +187,6 @@ class _State(ProgressColumn):
 
 
 def _name_of(bar: Bar) -> str:
-    """Return what is done, and the item at hand."""
     return f"{bar.description} {bar.fields['remark']}".rstrip()
 
 

@@ -57,7 +57,6 @@ def start(module: str, function: str) -> NoReturn:
 
 
 def _interrupt(number: int, _: FrameType | None) -> None:
-    """Raise KeyboardInterrupt; a second signal kills the process."""
     _came.append(number)
     signal.signal(number, signal.SIG_DFL)
     raise KeyboardInterrupt

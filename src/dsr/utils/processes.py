@@ -37,10 +37,6 @@ _LOST = "worker processes were killed twice, perhaps for want of memory; fewer w
 class InUseError(ValueError):
     """A command with other settings is at work in a directory."""
 
-    def __init__(self, folder: Path, owner: str) -> None:
-        super().__init__(f"{folder}: {owner} is at work there with other settings; wait for its end, or take another")
-        self.owner = owner
-
 
 @contextlib.contextmanager
 def at_work(folder: Path, settings: str) -> Iterator[None]:
@@ -62,7 +58,8 @@ def at_work(folder: Path, settings: str) -> Iterator[None]:
         for other in place.glob("command-*"):
             if not other.name.startswith(beginning) and _is_held(other):
                 host, _, process = other.stem.split("-", 2)[2].rpartition("-")
-                raise InUseError(folder, f"process {process} of {host}")
+                owner = f"process {process} of {host}"
+                raise InUseError(f"{folder}: {owner} is at work there; wait for its end, or take another folder")
         yield
     finally:
         lock.release()
@@ -194,7 +191,6 @@ class Pool:
 
 
 def _begin(plan: bytes, threads: int | None) -> None:
-    """Prepare a worker, which ends with its parent."""
     interruption.end_with(os.getppid())
     if threads is not None:
         _set_threads(threads, threads)

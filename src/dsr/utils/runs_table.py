@@ -57,7 +57,6 @@ def list_scores(writer: SummaryWriter, scores: Mapping[str, float], step: int = 
 
 
 def _text(value: Any) -> str:
-    """Return a value as text, a dash for an absent one."""
     if value is None:
         return "-"
     return f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -69,7 +69,9 @@ def check_together(
                 size = size or working_size(depth, picture.rgb)
                 photo = photo_outlines(reduce_photo(picture.rgb, size), max(size) / max(depth.shape))
                 compared.append((pair, depth_outlines(depth, size), photo))
-        common = _of_most(bent)
+        votes = Counter(warning.code for each in bent for warning in each)
+        firsts = {warning.code: warning for each in reversed(bent) for warning in each}
+        common = [firsts[code] for code, count in votes.items() if 2 * count >= len(bent)]  # as the first one has it
         for pair in group:
             found[pair.name] += common
     in_order = _check_order(compared)
@@ -88,13 +90,6 @@ def alike(pairs: Sequence[Pair]) -> Iterable[list[Pair]]:
         folder = pair.depth.parent
         groups.setdefault(folder if folders[folder] > 1 else folder.parent, []).append(pair)
     return groups.values()
-
-
-def _of_most(warnings: Sequence[Sequence[Assumption]]) -> list[Assumption]:
-    """Return the warnings that at least half of some frames have, each as the first one has it."""
-    votes = Counter(warning.code for each in warnings for warning in each)
-    firsts = {warning.code: warning for each in reversed(warnings) for warning in each}
-    return [firsts[code] for code, count in votes.items() if 2 * count >= len(warnings)]
 
 
 def _sample(pairs: Sequence[Pair]) -> list[Pair]:
@@ -117,8 +112,8 @@ def check_planes(picture: Picture, pair: Pair, reading: Reading) -> list[Assumpt
     falls, encoding = inverse_votes(depth), picture.encoding
     disparity = encoding.range_type == "disparity"
     if falls.verdict == "falls":
-        given = "disparities rise with distance, as depth does" if disparity else (
-            "values fall with distance, as disparities do")  # fmt: skip
+        given = "disparities rise with distance, as depth does"
+        given = given if disparity else "values fall with distance, as disparities do"
         detail = f"straight over {falls.falling} of {falls.falling + falls.rising} planes; --range-type sets it"
         return [Assumption(given, detail, "falls-with-distance", falls.ratio)]
     step = 0.0  # to which values are rounded, as a fraction of their median
@@ -144,15 +139,15 @@ def align(picture: Picture, *, register: bool) -> Picture:
     if verdict is not None and verdict.kind == "turned":  # no displacement is the cure
         return replace(picture, assumptions=(*picture.assumptions, *_doubts(verdict)))
     found = find_displacement(picture.depth_lr, picture.rgb)
-    certain = found is not None and found.certain
-    notes = [] if certain or verdict is None else _doubts(verdict)
+    notes = [] if verdict is None or (found is not None and found.certain) else _doubts(verdict)
     if register:
-        done = Assumption("--register: the depth map is moved to the photo's edges", f"by {found}")
-        if not certain:
+        if found is not None and found.certain:
+            done = Assumption("--register: the depth map is moved to the photo's edges", f"by {found}")
+            picture = replace(picture, depth_lr=undo(picture.depth_lr, found))
+        else:
             why = "there are not enough depth edges to compare" if found is None else "no displacement is certain"
             done = Assumption(f"--register: {why}, the depth map stays where it is")
-        depth_lr = undo(picture.depth_lr, found) if found is not None and certain else picture.depth_lr
-        return replace(picture, depth_lr=depth_lr, assumptions=(*picture.assumptions, done, *notes))
+        return replace(picture, assumptions=(*picture.assumptions, done, *notes))
     if found is not None and found.visible:
         sides = "to the right" if found.right > 0 else "to the left", "below" if found.down > 0 else "above"
         shifts = zip((abs(found.right), abs(found.down)), sides, strict=True)
@@ -177,7 +172,6 @@ def _check_order(compared: Sequence[tuple[Pair, Outlines, Outlines]]) -> list[As
 
 
 def _doubts(verdict: Verdict) -> list[Assumption]:
-    """Return a warning if a pair can hardly belong together."""
     if not verdict.code:
         return []
     cure = {

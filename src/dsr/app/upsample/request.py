@@ -12,7 +12,7 @@ from dsr.app.requests import check_method
 from dsr.app.upsample.parts import Results
 from dsr.inference import DEFAULT, WIDEST, Fill
 from dsr.io.reading import Reading, Shard, parse_shard
-from dsr.utils.options import OptionError, Options, Rule, group, option, positive, recorded
+from dsr.utils.options import OptionError, Options, Rule, at_least, group, option, positive, recorded
 from dsr.utils.versions import file_hash, hash_outside_code
 
 if TYPE_CHECKING:
@@ -80,11 +80,7 @@ class FrameChoice(Options):
         recorded=False,
     )
     workers: int = option(
-        1,
-        "pictures at a time, each in its own process (default: 1)",
-        "N",
-        rule=Rule("1 or more", lambda count: count >= 1),
-        recorded=False,
+        1, "pictures at a time, each in its own process (default: 1)", "N", rule=at_least(1), recorded=False
     )
 
     def __post_init__(self) -> None:
@@ -185,14 +181,12 @@ class Upsampling(Options):
             run = replace(self, device="cpu").upsampler()
             try:
                 run.check_working_size()
-            except ValueError as error:
-                raise ValueError(f"--working-size{str(error).removeprefix('working_size')}") from error
-            try:
                 run.first()
             except ValueError as error:
                 key = str(error).partition(":")[0]
-                flag = "--" if key in SHORTCUTS else "--set "
-                raise ValueError(f"{flag}{error}" if key in self.arguments else str(error)) from error
+                flags = {name: f"--set {name}" for name in self.arguments}
+                flags |= {"working_size": "--working-size", "noise": "--noise", "smooth": "--smooth"}
+                raise ValueError(f"{flags.get(key, key)}{str(error).removeprefix(key)}") from error
         if self.sensor not in ("auto", "none"):
             from dsr.degradation.sensors import sensor_named  # noqa: PLC0415 - other values are refused without torch
 
@@ -236,9 +230,8 @@ class UpsampleRequest(Options):
     def __post_init__(self) -> None:
         """Check what depends on several options, then what takes seconds to check."""
         if self.frames.confidence and self.reading.min_confidence is None:
-            raise OptionError(
-                "confidence", "expected --min-confidence with it, the fraction below which pixels are holes"
-            )
+            expected = "expected --min-confidence with it, the fraction below which pixels are holes"
+            raise OptionError("confidence", expected)
         self.upsampling.check_slowly()
 
     @functools.cached_property
@@ -262,19 +255,6 @@ def files_of(pair: Pair, reading: Reading) -> dict[str, Path]:
     return {name: each if isinstance(each, Path) else each.file for name, each in _inputs(pair, reading).items()}
 
 
-def inputs_of(pair: Pair, reading: Reading) -> dict[str, Record]:
-    """Return the inputs and their hashes, as values for JSON."""
-    inputs: dict[str, Record] = {}
-    for name, each in _inputs(pair, reading).items():
-        if not isinstance(each, Path):
-            inputs[name] = each.record()
-        elif each.is_file():
-            inputs[name] = {"file": each.name, "sha256": file_hash(each)}
-        else:
-            raise ValueError(f"{each}: there is no such file")
-    return inputs if pair.capture is None else {**inputs, "capture": pair.capture.record()}
-
-
 def _inputs(pair: Pair, reading: Reading) -> dict[str, Path | Source]:
     """Return the inputs: files, or in captures what is no file of its own."""
     given = reading.camera.fov is not None or reading.camera.intrinsics is not None
@@ -290,11 +270,23 @@ def _inputs(pair: Pair, reading: Reading) -> dict[str, Path | Source]:
     return {name: each for name, each in found.items() if each is not None}
 
 
+def _inputs_of(pair: Pair, reading: Reading) -> dict[str, Record]:
+    inputs: dict[str, Record] = {}
+    for name, each in _inputs(pair, reading).items():
+        if not isinstance(each, Path):
+            inputs[name] = each.record()
+        elif each.is_file():
+            inputs[name] = {"file": each.name, "sha256": file_hash(each)}
+        else:
+            raise ValueError(f"{each}: there is no such file")
+    return inputs if pair.capture is None else {**inputs, "capture": pair.capture.record()}
+
+
 def inputs_with_neighbours(request: UpsampleRequest, pair: Pair, neighbours: Sequence[Pair]) -> dict[str, Record]:
     """Return the inputs of a frame, its neighbours and its pose, and their hashes, as values for JSON."""
-    inputs = inputs_of(pair, request.reading)
+    inputs = _inputs_of(pair, request.reading)
     for number, other in enumerate(neighbours, 1):
-        inputs |= {f"neighbour_{number}_{name}": each for name, each in inputs_of(other, request.reading).items()
+        inputs |= {f"neighbour_{number}_{name}": each for name, each in _inputs_of(other, request.reading).items()
                    if name not in ("rgb", "depth_camera", "extrinsics")}  # fmt: skip
     if request.frames.poses is not None:
         inputs["poses"] = {"file": request.frames.poses.name, "sha256": file_hash(request.frames.poses)}

@@ -39,8 +39,8 @@ from dsr.metrics.classes import compute_means, in_table_units
 from dsr.metrics.functional import SurfacePair, rmse_v
 from dsr.metrics.losses import VisualLossName, lap1, make_visual_loss, match_weight, mse
 from dsr.sample import DepthSample
+from dsr.utils.checkpoints import ScoreTables, StepProgress, fit, make_trainer
 from dsr.utils.guards import expect_positive
-from dsr.utils.lightning import ScoreTables, StepProgress, fit, make_trainer
 from dsr.utils.progress import Progress, Steps, StepsProgress
 from dsr.utils.runs_table import list_run
 

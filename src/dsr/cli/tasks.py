@@ -1,17 +1,21 @@
-"""``dsr study``: ask people which rendering looks most like the ground truth, and collect their answers."""
+"""``dsr study`` and ``dsr export``: ask people which rendering looks best, and write a network as an ONNX file."""
 
 from __future__ import annotations
 
 from rich.console import Console
 
-from dsr.app.requests import AnswersRequest, StudyRequest
+import dsr
+from dsr.app.requests import AnswersRequest, ExportRequest, StudyRequest
 from dsr.evaluation.run_files import load_results
+from dsr.methods.networks.network_file import OnnxGraph, write_onnx
+from dsr.methods.recipe import read_recipe
 from dsr.notes import expect_no_warning
 from dsr.report.study.files import KEY_NAME, files_of, read_all, read_key
 from dsr.report.study.percentages import collect, remarks, tables_of
 from dsr.report.study.questionnaire import build_study
 from dsr.utils.console import ConsoleProgress, show
 from dsr.utils.files import expect_target, write_text
+from dsr.utils.progress import megabytes
 
 
 def build_page(request: StudyRequest, console: Console) -> list[str]:
@@ -53,4 +57,22 @@ def collect_answers(request: AnswersRequest, console: Console) -> list[str]:
         show(console, line)
     write_text(path, table.to_csv(index=False, float_format="%.6g"))
     show(console, f"{path}  {len(answers)} of {len(files)} files count{', see above' if left_out else ''}")
+    return []
+
+
+def export_onnx(request: ExportRequest, console: Console) -> list[str]:
+    """Write the file, check it, and show its inputs and outputs."""
+    net = read_recipe(request.method, None, request.directories).with_weights(request.weights).network(request.scale)
+    graph = OnnxGraph(net, request.scale)
+    facts = {"dsr": dsr.__version__, "method": request.method, "scale": request.scale, "network": type(net).__name__}
+    difference = write_onnx(request.path, graph, facts)
+    size = megabytes(request.path.stat().st_size)
+    lines = (
+        f"{request.method} x{request.scale} -> {request.path}, {size}",
+        f"  inputs: photo (1, 3, H, W), inverse_depth and valid (1, 1, H / {request.scale}, W / {request.scale})",
+        f"  outputs: {', '.join(graph.outputs)} (1, 1, H, W)",
+        f"  onnxruntime differs from PyTorch by at most {difference:.1g} of the range",
+    )
+    for line in lines:
+        show(console, line)
     return []

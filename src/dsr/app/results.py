@@ -1,9 +1,10 @@
-"""The command behind ``dsr fuse``: one mesh of the results of a sequence."""
+"""The commands behind ``dsr view`` and ``dsr fuse``: one page, or one mesh, of results of ``dsr upsample``."""
 
 from __future__ import annotations
 
 import itertools
 import math
+import webbrowser
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -12,46 +13,102 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from dsr.app.requests import FuseRequest
+from dsr.app.requests import FuseRequest, ViewRequest
 from dsr.app.upsample.parts import ERRORS
-from dsr.app.upsample.stored import INFO, read_camera, read_complete, read_depth, read_errors, read_up
+from dsr.app.upsample.stored import (
+    INFO,
+    find_results,
+    read_camera,
+    read_complete,
+    read_depth,
+    read_errors,
+    read_result,
+    read_up,
+)
 from dsr.geometry.mesh import fuse_maps, suggest_voxel
 from dsr.geometry.poses import PosedMap, as_rigid, check_poses
 from dsr.io.exports import INPUT, read_input, world_comment, write_ply
 from dsr.io.images import read_pixels
 from dsr.io.scene_files import RGBD
 from dsr.notes import Assumption, expect_no_warning
-from dsr.utils.console import one_line, show
-from dsr.utils.guards import natural_key
-from dsr.utils.progress import show_length
+from dsr.report.surface_page import Packed, is_view, pack_result, save_view
+from dsr.utils.console import ConsoleProgress, one_line, show
+from dsr.utils.files import expect_target
+from dsr.utils.guards import natural_key, refusing_excess
+from dsr.utils.progress import megabytes, show_length
 
+_WHOLE_PAGE = 6  # the page has at most this many times the vertices of one surface
+_PHOTO, _SMALL_PHOTO, _FEW = 2048, 1024, 4  # pixels of the photos' longer side on pages of few results, and of more
 _GREY = 190
 _SEEN = 2.0  # voxels between a point and a frame's depth up to which the frame sees it
 _LEAST_ERROR = 1e-4  # smallest expected error in metres that a weight distinguishes
 
 
+def view(request: ViewRequest, console: Console) -> list[str]:
+    """Write the page and open it; return the problems of results that cannot be read, one line each."""
+    page = request.page or request.output / "view.html"
+    expect_target(page)
+    if page.exists() and not (page.is_file() and is_view(page)):
+        raise ValueError(f"{page}: is there already and no page of `dsr view`; take another -o")
+    folders = find_results(request.output)
+    places = np.linspace(0, len(folders) - 1, min(len(folders), request.most)).round()
+    chosen = [folders[at] for at in np.unique(places.astype(int))]
+    packed, problems = _pack(request, chosen, console)
+    if not packed:
+        raise ValueError("; ".join(problems))
+    notes = []
+    if len(chosen) < len(folders):
+        notes.append(f"{len(chosen)} of {len(folders)} results, taken at equal distances; --most N shows more.")
+    if problems:
+        notes.append(f"{len(problems)} of {len(chosen)} results could not be read and are left out.")
+    name = request.output.resolve().name
+    save_view(page, packed, title=f"{name}: depth before and after", notes=notes)
+    for note in notes:
+        show(console, f"  {note}")
+    largest, factors = max(each.vertices for each in packed), sorted({each.about["after"]["factor"] for each in packed})
+    reduced = "" if factors == [1] else f", maps reduced by {' or '.join(map(str, factors))} each way"
+    size = megabytes(page.stat().st_size)
+    show(console, f"{_count(packed)}, at most {largest:,} vertices each{reduced}, {size} -> {page}")
+    if request.open_page and not webbrowser.open(page.resolve().as_uri()):
+        show(console, "there is no browser to open it with; open it yourself, or copy it to where there is one")
+    return problems
+
+
+def _pack(request: ViewRequest, folders: Sequence[Path], console: Console) -> tuple[list[Packed], list[str]]:
+    """Return the packed results, and what is wrong with the others."""
+    each = min(request.vertices, _WHOLE_PAGE * request.vertices // len(folders))
+    photo_side = _PHOTO if len(folders) <= _FEW else _SMALL_PHOTO
+    packed: list[Packed] = []
+    problems: list[str] = []
+    for folder in ConsoleProgress(console).track(folders, "read", label=lambda path: path.name, lines=False):
+        name = "/".join(folder.relative_to(request.output).parts) or request.output.resolve().name
+        try:
+            with refusing_excess():
+                packed.append(pack_result(read_result(folder, name), each, photo_side))
+        except (ValueError, OSError) as error:
+            problems.append(one_line(error))
+    return packed, problems
+
+
 def fuse(request: FuseRequest, console: Console) -> list[str]:
     """Fuse the depth of results into a mesh, and return the problems, one line each."""
     max_error = request.max_error / 100
-    found = sorted({path.parent for folder in request.folders for path in folder.rglob(INFO)}, key=natural_key)
-    frames: list[Path] = []
+    recordings: dict[Path, list[Path]] = {}
     problems: list[str] = []
-    for folder in found:
+    for folder in sorted({each for place in request.folders for each in find_results(place)}, key=natural_key):
         try:
             _load(folder, max_error)
-            frames.append(folder)
+            recordings.setdefault(folder.parent, []).append(folder)
         except (ValueError, OSError) as error:
             problems.append(one_line(error))
+    frames = sorted(itertools.chain(*recordings.values()), key=natural_key)
     if not frames:
-        what = problems[0] if problems else f"{request.folders[0]}: found no {INFO}"
-        raise ValueError(f"expected results of `dsr upsample` with poses; {what}")
+        raise ValueError(f"expected results of `dsr upsample` with poses; {problems[0]}")
 
-    def fault(folder: Path) -> Assumption | None:
-        recording = [frame for frame in frames if frame.parent == folder]
+    def fault(recording: Sequence[Path]) -> Assumption | None:
         return check_poses(len(recording), lambda number: _load(recording[number], max_error))
 
-    parents = dict.fromkeys(frame.parent for frame in frames)
-    warnings = [each for each in dict.fromkeys(map(fault, parents)) if each is not None]
+    warnings = [each for each in dict.fromkeys(map(fault, recordings.values())) if each is not None]
     if request.strict:
         expect_no_warning(str(request.folders[0]), warnings)
     for each in warnings:
@@ -70,11 +127,14 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
     comment = world_comment(ups.pop() if len(ups) == 1 else "")
     write_ply(request.output, mesh.vertices, colours, mesh.normals, mesh.faces, frame=comment)
     size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, voxels of {show_length(voxel)}"
-    count = "1 result" if len(frames) == 1 else f"{len(frames)} results"
-    show(console, f"{count} -> {request.output}: {size}; in the world's frame of the poses")
+    show(console, f"{_count(frames)} -> {request.output}: {size}; in the world's frame of the poses")
     if request.score:
         show(console, f"successive results differ by {_difference(frames, max_error)} (OPW)")
     return problems
+
+
+def _count(results: Sequence[object]) -> str:
+    return "1 result" if len(results) == 1 else f"{len(results)} results"
 
 
 def _difference(frames: Sequence[Path], max_error: float) -> str:
@@ -93,7 +153,6 @@ def _difference(frames: Sequence[Path], max_error: float) -> str:
 
 
 def _load(folder: Path, max_error: float) -> PosedMap:
-    """Return a result."""
     path, info = folder / INFO, read_complete(folder)
     if info.get("pose") is None:
         raise ValueError(f"{path}: expected a pose; run `dsr upsample` on a capture with poses, or with --poses")
@@ -110,11 +169,7 @@ def _load(folder: Path, max_error: float) -> PosedMap:
 def _colours(
     vertices: np.ndarray, frames: Sequence[Path], max_error: float, near: float, problems: list[str]
 ) -> np.ndarray:
-    """Return the mean colour that the photos of results have at points, (N, 3) uint8, grey where none sees them.
-
-    A frame sees a point that is at most ``near`` metres from its depth. ``problems`` gets a line for a photo that
-    cannot be read.
-    """
+    """Return the mean colour of points at most ``near`` metres from frames' depth, (N, 3) uint8; grey without photo."""
     total, weight = np.zeros(vertices.shape), np.zeros(len(vertices))
     for folder in frames:
         try:
