@@ -98,8 +98,7 @@ def get_data_sets(request: DataGetRequest, console: Console) -> list[str]:
         _describe(collection, console)
     if items:
         show(console, f"{missing} of {len(items)} files are missing in {root.absolute()}")
-    asks = missing and not request.yes and sys.stdin.isatty() and console.is_terminal
-    if asks and not Confirm.ask("fetch them?", console=console, default=True):
+    if missing and not request.yes and sys.stdin.isatty() and console.is_terminal and not _agreed(console):
         return []
     problems = []
     if items:
@@ -110,6 +109,14 @@ def get_data_sets(request: DataGetRequest, console: Console) -> list[str]:
     if not problems:
         show(console, f"{', '.join(collection.name for collection in collections)}: complete")
     return problems
+
+
+def _agreed(console: Console) -> bool:
+    """Ask for confirmation, and return whether the user agrees; Ctrl-D does not."""
+    try:
+        return Confirm.ask("fetch them?", console=console, default=True)
+    except EOFError:
+        return False
 
 
 def _describe(collection: Collection, console: Console) -> None:
