@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from torch import Tensor
 
+from dsr.data.folder import Folder
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.geometry.camera import Camera, from_range
+from dsr.geometry.camera import from_range
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.metrics.catalogue import Score, catalogue, score_image
 from dsr.metrics.formats import in_tables
@@ -35,13 +35,7 @@ def network(shared: Path) -> LPIPS:
 
 @cache
 def _scene(shared: Path, name: str) -> Scene:
-    folder = shared / "scenes" / name
-    stored = json.loads((folder / "camera.json").read_text())
-    camera = Camera(**{key: stored[key] for key in ("width", "height", "fx", "fy", "cx", "cy", "baseline", "doffs")})
-    with Image.open(folder / "rgb.png") as image:
-        rgb = torch.from_numpy(np.array(image.convert("RGB"))).permute(2, 0, 1) / 255
-    disparity = torch.from_numpy(np.load(folder / "disparity.npy").astype(np.float64))[None]
-    return Scene("golden", name, rgb, camera, from_range(disparity, camera, "disparity"))
+    return Folder(str(shared / "scenes"), [name]).load(name)
 
 
 def _prediction(shared: Path, scene: Scene, method: str, scale: int) -> Tensor:

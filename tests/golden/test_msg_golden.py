@@ -1,16 +1,16 @@
 """MSG and MSG-V with their authors' weights, against the disparity maps that the published networks give."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.data.folder import Folder
+from dsr.degradation.downsampling import Downsampling, make_sample
+from dsr.geometry.camera import from_range, to_range
 from dsr.methods.images import upsample_bicubic
 from dsr.methods.networks.msg_net import VariantName
 from dsr.methods.networks.network import Precision
@@ -25,15 +25,10 @@ FILES: dict[str, tuple[VariantName, str]] = {
 
 def _sample(shared: Path, scene: str, scale: int) -> tuple[DepthSample, Tensor]:
     """Return the scene with its box-downsampled disparity (as depth), and the true disparity, (1, 512, 512)."""
-    folder = shared / "scenes" / scene
-    stored = json.loads((folder / "camera.json").read_text())
-    camera = Camera(**{key: stored[key] for key in ("width", "height", "fx", "fy", "cx", "cy", "baseline", "doffs")})
-    coarse = camera.rescale(camera.width // scale, camera.height // scale)
-    disparity = torch.from_numpy(np.load(folder / "disparity.npy"))[None]
-    with Image.open(folder / "rgb.png") as image:
-        rgb = torch.from_numpy(np.array(image.convert("RGB"))).permute(2, 0, 1) / 255
-    depth_lr = from_range(functional.avg_pool2d(disparity, scale) / scale, coarse, "disparity")
-    return DepthSample("golden", scene, rgb, depth_lr, camera, coarse, scale), disparity
+    loaded = Folder(str(shared / "scenes"), [scene]).load(scene)
+    assert loaded.depth is not None
+    disparity = to_range(loaded.depth, loaded.camera, "disparity")
+    return make_sample(loaded, scale, Downsampling("box"), "disparity"), disparity
 
 
 def _upsampled(shared: Path, method: str, sample: DepthSample, precision: Precision = "float32") -> Tensor:
