@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from bombs import Trap
 from commands import Program, run_python
 from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -327,20 +328,13 @@ def test_fast_dev_run_does_one_step_and_writes_no_weights(tmp_path, within):
     assert not [name for name in tree(tmp_path / "out") if name.endswith((".ckpt", ".safetensors"))]
 
 
-class Unpickled:
-    """Makes a directory where it is unpickled."""
-
-    def __reduce__(self):
-        return os.mkdir, ("executed",)
-
-
 def state_of_best(checkpoint):
     [state] = [each for each in checkpoint["callbacks"].values() if each.get("monitor")]
     return state
 
 
 REFUSED = {
-    "an object": lambda checkpoint: checkpoint.update(hyper_parameters=Unpickled()),
+    "an object": lambda checkpoint: checkpoint.update(hyper_parameters=Trap(Path("executed"))),
     "files elsewhere": lambda checkpoint: state_of_best(checkpoint).update(
         best_k_models={f"{state_of_best(checkpoint)['dirpath']}/../../mine": torch.ones(())}
     ),
