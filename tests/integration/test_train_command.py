@@ -197,11 +197,13 @@ def test_diverged_training_writes_no_weights_of_it(tmp_path, within):
 
 
 USAGE_ERRORS = {
+    "a weight that is none": (["loss.w=abc"], "loss.w: "),
     "a mistyped loss": (["model.objective.depth_loss=l3"], "model.objective.depth_loss: "),
     "no step": (["trainer.max_steps=0"], "trainer.max_steps: "),
     "a learning rate of nan": (["model.optimizer.lr=nan"], "model.optimizer: "),
     "an argument of the trainer that dsr sets": (["+trainer.num_nodes=2"], "trainer.num_nodes: "),
     "a trainer that Lightning refuses": (["+trainer.gradient_clip_algorithm=foo"], "trainer: "),
+    "an unknown argument of the trainer": (["+trainer.tpu_cores=3"], "trainer.tpu_cores: "),
     "a visual loss of a model without": (["model=msg", "loss.visual=dssim"], "loss.visual: model=msg has "),
     "a visual loss without its network": (["loss.visual=lpips", "metrics.lpips_trunk=none.pth"], "loss.visual: lpips "),
     "a patch larger than a scene": (["patches.patch=128"], "patches.patch: expected at most 00000's 64 x 64, got 128"),
