@@ -62,27 +62,22 @@ def npy_sparse(path: Path) -> None:
         file.truncate(file.tell() + (4 << 30))
 
 
-def _png(width: int, height: int, rows: int) -> bytes:
-    """Return a grey PNG that has ``rows`` rows of zeros, whatever its header says."""
+def png(path: Path, side: int = 1 << 14) -> None:
+    """Write a square grey PNG of zeros, 2^28 pixels by default."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
     packing = zlib.compressobj(1)
-    row = b"\0" * (1 + 2 * width) if rows else b""
-    data = b"".join(packing.compress(row) for _ in range(rows)) + packing.flush()
-    header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
-
-
-def png(path: Path) -> None:
-    """Write a PNG of 2^28 pixels."""
-    path.write_bytes(_png(1 << 14, 1 << 14, 1 << 14))
+    row = b"\0" * (1 + 2 * side)
+    data = b"".join(packing.compress(row) for _ in range(side)) + packing.flush()
+    header = struct.pack(">IIBBBBB", side, side, 16, 0, 0, 0, 0)
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b""))
 
 
 def png_of_16_megapixels(path: Path) -> None:
     """Write a PNG of 2^24 pixels."""
-    path.write_bytes(_png(1 << 12, 1 << 12, 1 << 12))
+    png(path, 1 << 12)
 
 
 def jpeg(path: Path) -> None:

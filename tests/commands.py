@@ -44,15 +44,9 @@ def _ask(request: Mapping[str, Any]) -> Any:
 class Program:
     """A Python program at work; used as a context manager, it is killed at the end if it is still at work.
 
-    Args:
-        arguments: the program's path, or ``-m`` and a module's name, and its arguments.
-        cwd: directory that it runs in.
-        env: its environment; None for that of the tests with one thread, and without what changes scores and errors.
-
-    Attributes:
-        pid: number of the process, which leads a group of its own.
-        returncode: the exit code, None until :meth:`communicate` has seen its end.
-
+    ``arguments`` are the program's path, or ``-m`` and a module's name, and its arguments; its environment is that of
+    the tests with one thread, and without what changes scores and errors, if there is no ``env``. Its ``pid`` leads a
+    group of processes; ``returncode`` is None until :meth:`communicate` has seen its end.
     """
 
     def __init__(self, *arguments: str, cwd: Path, env: Mapping[str, str] | None = None) -> None:
@@ -89,12 +83,7 @@ class Program:
         signal.pidfd_send_signal(self._handle, number)
 
     def communicate(self, timeout: float = 300) -> tuple[str, str]:
-        """Wait for its end, and return what it wrote to stdout and stderr.
-
-        Raises:
-            subprocess.TimeoutExpired: it took longer, and was killed.
-
-        """
+        """Wait for its end, and return what it wrote to stdout and stderr; after ``timeout`` seconds it is killed."""
         self.returncode = _ask({"process": self.pid, "timeout": timeout})
         os.close(self._handle)
         stdout, stderr = (path.read_text(encoding="utf-8") if path.exists() else "" for path in self._outputs)
@@ -108,18 +97,7 @@ class Program:
 def run_python(
     *arguments: str, cwd: Path, env: Mapping[str, str] | None = None, timeout: float = 300
 ) -> subprocess.CompletedProcess[str]:
-    """Run a Python program to its end.
-
-    Args:
-        arguments: see :class:`Program`, also for the next ones.
-        cwd: see there.
-        env: see there.
-        timeout: seconds after which it is killed.
-
-    Raises:
-        subprocess.TimeoutExpired: it took longer.
-
-    """
+    """Run a Python program to its end, see :class:`Program`; it is killed after ``timeout`` seconds."""
     program = Program(*arguments, cwd=cwd, env=env)
     outputs = program.communicate(timeout)
     assert program.returncode is not None

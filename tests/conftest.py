@@ -31,8 +31,9 @@ UNIT_TESTS = REPOSITORY / "tests" / "unit"
 NIGHTLY = tuple(REPOSITORY / "tests" / name for name in ("chaos", "fuzz"))
 CHROMIUMS = ("chromium", "chromium-browser", "google-chrome")
 CHROMIUM_ARGUMENTS = (
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync",
+    "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
+    "--disable-sync", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
 )  # fmt: skip
 
 
@@ -57,7 +58,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         fixtures = getattr(item, "fixturenames", ())
         if "shared" in fixtures:
             item.add_marker("shared")
-        if "browser" in fixtures:
+        if "webgl_browser" in fixtures:
             item.add_marker("browser")
         if UNIT_TESTS not in item.path.parents or "in_process" in fixtures:
             item.add_marker("slow")
@@ -153,8 +154,8 @@ def serve(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[type[BaseHTTPRe
 
 
 @pytest.fixture(scope="session")
-def browser() -> Iterator[Any]:
-    """A headless Chromium, driven by playwright; $DSR_CHROMIUM names another than the one on the path."""
+def webgl_browser() -> Iterator[Any]:
+    """A headless Chromium with WebGL on the CPU, driven by playwright; $DSR_CHROMIUM names another than the path's."""
     path = os.environ.get("DSR_CHROMIUM") or next(filter(None, map(shutil.which, CHROMIUMS)), None)
     sync_api = pytest.importorskip("playwright.sync_api")
     if path is None:
@@ -168,24 +169,13 @@ def browser() -> Iterator[Any]:
         started.close()
 
 
-@pytest.fixture(scope="session")
-def webgl_browser(browser: Any) -> Iterator[Any]:
-    """A headless Chromium that has WebGL, computed by the CPU."""
-    path = os.environ.get("DSR_CHROMIUM") or next(filter(None, map(shutil.which, CHROMIUMS)), None)
-    plain = [argument for argument in CHROMIUM_ARGUMENTS if argument != "--disable-gpu"]
-    graphics = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-    started = browser.browser_type.launch(executable_path=path, args=plain + graphics)
-    yield started
-    started.close()
-
-
 @pytest.fixture
 def window(webgl_browser: Any) -> Iterator[Callable[..., Window]]:
-    """Return what opens a window, of another browser or with options; what its page does wrong fails the test."""
+    """Return what opens a window with options of its context; what its page does wrong fails the test."""
     windows: list[Window] = []
 
-    def make(browser: Any = webgl_browser, **options: Any) -> Window:
-        windows.append(Window(browser, **options))
+    def make(**options: Any) -> Window:
+        windows.append(Window(webgl_browser, **options))
         return windows[-1]
 
     yield make

@@ -60,21 +60,17 @@ class CudaTensor(Tensor):
 
     @property
     def device(self) -> torch.device:  # type: ignore[override]
-        """The device."""
         return CUDA
 
     @property
     def is_cuda(self) -> bool:  # type: ignore[override]
-        """Whether it is on a GPU."""
         return True
 
     @property
     def is_meta(self) -> bool:  # type: ignore[override]
-        """Whether it is without values."""
         return False
 
     def __repr__(self) -> str:
-        """Show the values."""
         return f"{self.values!r} on {CUDA}"
 
     @classmethod
@@ -137,14 +133,12 @@ class _Generator(torch.Generator):
     on_cuda: bool
 
     def __new__(cls, device: Any = "cpu") -> _Generator:
-        """Make one of the CPU."""
         made = super().__new__(cls, "cpu")
         made.on_cuda = _is_cuda(device)
         return made
 
     @property
     def device(self) -> torch.device:  # type: ignore[override]
-        """The device."""
         return CUDA if self.on_cuda else _CPU
 
 

@@ -5,8 +5,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-from PIL import Image
+from small_frames import in_text, walk, write_recording
+
+from dsr.geometry.camera import Camera
 
 Origin = Callable[[Path], None] | tuple[str, str]
 """What makes a path, or the scenario and the path in its results that it is copied from."""
@@ -25,21 +26,10 @@ class Scenario(NamedTuple):
 
 
 def make_frames(folder: Path) -> None:
-    """Write six photos and depth maps of a box before a wall, from cameras 4 cm apart, and their poses beside."""
-    for kind in ("rgb", "depth"):
-        (folder / kind).mkdir(parents=True)
-    rng = np.random.default_rng(0)
-    v, u = np.mgrid[:48, :64]
-    for number in range(6):
-        inside = (abs(u - 32 + 2 * number) < 12) & (abs(v - 24) < 9)
-        photo = np.where(inside[..., None], (200, 60, 60), (60, 120, 200)).astype(np.uint8)
-        Image.fromarray(photo).save(folder / "rgb" / f"{number:03}.png")
-        depth = np.where(inside, 1200, 2000)[::2, ::2] + rng.normal(0, 5, (24, 32))
-        Image.fromarray(depth.round().astype(np.uint16)).save(folder / "depth" / f"{number:03}.png")
-    camera = {"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5}
-    (folder / "camera.json").write_text(json.dumps(camera))
-    poses = "".join(f"1 0 0 {0.04 * number} 0 1 0 0 0 0 1 0\n" for number in range(6))
-    (folder.parent / "poses.txt").write_text(poses)
+    """Write six photos and depth maps of a room, and their poses beside."""
+    poses = walk(6)
+    write_recording(folder, Camera.centred(32, 24, 30.0), poses)
+    (folder.parent / "poses.txt").write_text(in_text(poses))
 
 
 def make_answers(folder: Path) -> None:

@@ -14,23 +14,6 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 QUICK = ("metrics.lpips=false", "device=cpu")
 
 
-@pytest.mark.parametrize(
-    ("command", "arguments", "name"),
-    [
-        ("eval", ("dataset=icl", "method=bicubic"), "icl"),
-        ("train", ("dataset=paper_train", "trainer=smoke"), "middlebury_train"),
-    ],
-)
-def test_missing_dataset_names_the_command_that_fetches_it_and_nothing_is_written(
-    tmp_path, monkeypatch, in_process, command, arguments, name
-):
-    monkeypatch.delenv("DSR_DATA", raising=False)
-    code, _, [line] = in_process(command, *arguments, *QUICK)
-    assert (code, line.startswith(f"error: dataset={name}: expected its files in data")) == (2, True)
-    assert f"get it with: dsr data get {name};" in line
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_real_scenes_of_several_datasets_are_evaluated_by_one_command(monkeypatch, tmp_path, shared):
     monkeypatch.setenv("DSR_DATA", str(shared / "real"))
     done = run_python(

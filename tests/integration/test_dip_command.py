@@ -100,10 +100,3 @@ def test_holes_and_a_wrong_model_are_part_of_the_setting_name(tmp_path, run):
     assert np.isfinite(depth(tmp_path / "out", "statue")).all()
     assert run(*given, "output_dir=right")[0] == 0
     assert not np.array_equal(depth(tmp_path / "out", "statue"), depth(tmp_path / "right", "statue"))
-
-
-@pytest.mark.parametrize("wrong", ["method.steps=0", "holes.share=2", "downsampling.assumed=cubic"])
-def test_usage_error_is_one_line_and_writes_nothing(tmp_path, run, wrong):
-    code, _, [line] = run("method=dip_v", "holes=blobs", wrong)
-    assert (code, line.startswith(f"error: {wrong.partition('=')[0]}: ")) == (2, True)
-    assert not list(tmp_path.iterdir())

@@ -1,7 +1,6 @@
 """The README, the documentation's pages and CITATION.cff: sizes, links, and commands that parse."""
 
 import importlib.util
-import os
 import re
 import shlex
 from collections.abc import Iterator
@@ -9,10 +8,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import pandas as pd
 import pytest
 import yaml
-from commands import run_python
 from hydra import compose, initialize_config_dir
 
 from dsr.app.schema import EvalConfig, TrainConfig, plain_config, register
@@ -20,22 +17,16 @@ from dsr.app.schema import EvalConfig, TrainConfig, plain_config, register
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 PAGES = (ROOT / "README.md", ROOT / "src/dsr/methods/weights/README.md", *sorted(DOCS.rglob("*.md")))
-EXTENDING = DOCS / "extend.md"  # Its commands use the modules that it contains; a test runs them
-
-
-def load_hook() -> ModuleType:
-    """Return the module that writes the generated pages; it is no part of the package."""
-    spec = importlib.util.spec_from_file_location("reference", DOCS / "hooks" / "reference.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+EXTENDING = DOCS / "extend.md"  # Its commands use the modules that it contains; test_extensions runs them
 
 
 @pytest.fixture(scope="module")
 def hook() -> ModuleType:
-    return load_hook()
+    """The module that writes the generated pages; it is no part of the package."""
+    specification = importlib.util.spec_from_file_location("reference", DOCS / "hooks" / "reference.py")
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture(scope="module")
@@ -43,19 +34,16 @@ def generated(hook: ModuleType) -> dict[str, str]:
     return hook.generated_pages()
 
 
-def commands(name: str) -> Iterator[tuple[str, list[str]]]:
-    """Yield the lines of the pages' shell blocks that begin with ``name``, and their arguments."""
+def parametrize(name: str) -> Any:
+    """Parametrize by the arguments of the distinct lines of the pages' shell blocks that begin with ``name``."""
+    found, start = {}, name.split()
     for page in PAGES:
         for block in re.findall(r"^```sh\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL):
             for line in block.replace("\\\n", " ").splitlines():
                 words = shlex.split(line, comments=True)
-                if page != EXTENDING and words[: len(name.split())] == name.split():
-                    yield f"{page.name}: {' '.join(words)}", words[len(name.split()) :]
-
-
-def parametrize(name: str) -> Any:
-    found = dict(commands(name))
-    return pytest.mark.parametrize("arguments", found.values(), ids=found.keys())
+                if page != EXTENDING and words[: len(start)] == start:
+                    found.setdefault(" ".join(words), words[len(start) :])
+    return pytest.mark.parametrize("arguments", found.values(), ids=found)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -102,42 +90,6 @@ def test_evaluation_of_the_documentation_composes(arguments: list[str]) -> None:
 def test_training_of_the_documentation_composes(arguments: list[str]) -> None:
     for config in compose_each("train", arguments):
         assert TrainConfig.of(config).scale in (4, 8)
-
-
-@pytest.fixture(scope="module")
-def extension(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the files of the page about extending."""
-    folder = tmp_path_factory.mktemp("extension")
-    blocks = re.findall(r'^```\w+ title="([^"]+)"\n(.*?)^```', EXTENDING.read_text(), re.MULTILINE | re.DOTALL)
-    for path, content in blocks:
-        (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        (folder / path).write_text(content)
-    return folder
-
-
-def run_example(about: str, extension: Path, *added: str) -> str:
-    """Run the first Python command of the page that contains ``about``, with more arguments; return its output."""
-    line = next(line for line in EXTENDING.read_text().splitlines() if line.startswith("PYTHONPATH") and about in line)
-    _, _, name, *arguments = shlex.split(line)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), "."]), "OMP_NUM_THREADS": "1"}
-    done = run_python(str(ROOT / name), *arguments, *added, cwd=extension, env=environment)
-    assert (done.returncode, done.stderr) == (0, "")
-    return done.stdout
-
-
-def test_examples_of_a_method_a_data_set_and_a_metric_run_together(extension: Path) -> None:
-    output = run_example("metrics=mine", extension, "metrics.lpips=false", "device=cpu", "output_dir=run")
-    assert re.search(r"Bump_d\s+RMSE_v\s+PSNR", output)
-    assert set(pd.read_csv(extension / "run" / "scores.csv")["method"]) == {"blend"}
-
-
-@pytest.mark.nightly
-def test_examples_of_a_network_an_optimiser_and_a_callback_train(extension: Path, dsr_cache: Path) -> None:
-    small = ("trainer=smoke", "dataset.size=64", "dataset.count=8", "metrics.lpips=false", "device=cpu")
-    run_example("train.py", extension, *small)
-    assert (extension / "outputs" / "train" / "tiny" / "weights.safetensors").is_file()
-    run_example("optimizer=rprop", extension, *small, "output_dir=more")
-    assert "Rprop" in (extension / "more" / "config.yaml").read_text()
 
 
 def test_command_reference_has_every_command_and_option(hook: ModuleType, generated: dict[str, str]) -> None:
