@@ -17,6 +17,7 @@ import pandas as pd
 import pytest
 import torch
 from browser_pages import Window
+from hydra.core.hydra_config import HydraConfig
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.evaluation.results import prediction_path, sample_path
@@ -186,7 +187,7 @@ def window(webgl_browser: Any) -> Iterator[Callable[..., Window]]:
 @pytest.fixture
 def in_process(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> Callable[..., tuple[int, str, list[str]]]:
+) -> Iterator[Callable[..., tuple[int, str, list[str]]]]:
     """Return a runner of ``eval.py`` and ``train.py`` in this process: exit code, output, lines of errors."""
     from dsr.app.entry import run_command  # noqa: PLC0415 - takes seconds, as the next ones
     from dsr.app.evaluate import evaluate  # noqa: PLC0415
@@ -207,7 +208,8 @@ def in_process(
         captured = capfd.readouterr()
         return code, captured.out, captured.err.splitlines()
 
-    return call
+    yield call
+    HydraConfig.instance().cfg = None  # as in a process without a command
 
 
 @pytest.fixture(scope="session")

@@ -1,9 +1,11 @@
 """Situations that people reported of programs like this one, each with the values that must come out."""
 
 import dataclasses
+import importlib
 import json
 import math
 import pickle
+import pkgutil
 import re
 import shutil
 import struct
@@ -451,7 +453,8 @@ def test_make_benchmark_runs_the_cases_that_the_page_has():
 
 def test_doctor_knows_every_data_set_of_recorded_scenes(shared, tmp_path):
     root = Path(__file__).resolve().parents[2]
-    known = {name for *_, name in detection._detected()} | {"nyu"}
+    modules = [importlib.import_module(f"dsr.data.{each.name}") for each in pkgutil.iter_modules(dsr.data.__path__)]
+    known = {name for each in modules for *_, name in getattr(each, "DETECTED", ())} | {"nyu"}
     own = {"folder", "simgeo", "procedural", "mixture", "paper_train", "rgbdd_real"}  # of the user, rendered, of others
     choices = {path.stem for path in (root / "conf/dataset").glob("*.yaml") if not path.stem.startswith("middlebury")}
     assert choices - own <= known

@@ -96,7 +96,6 @@ def test_sizes_and_cameras_of_known_data_sets_give_the_unit(tmp_path, capsys):
         ((DEPTH - DEPTH.min()) / np.ptp(DEPTH), ("normalised", "--depth-unit METRES")),
         (np.uint16(257) * np.round(255 * DEPTH / DEPTH.max()).astype(np.uint16), ("for viewing", "--depth-unit")),
         (np.round(255 * DEPTH / DEPTH.max()).astype(np.uint8), ("uint8", "for viewing")),
-        (cv2.applyColorMap(np.uint8(255 * DEPTH / DEPTH.max()), cv2.COLORMAP_JET), ("a picture for viewing",)),
         (np.where(np.random.default_rng(2).random(DEPTH.shape) < 0.1, MILLIMETRES, 0).astype(np.uint16),
          ("--depth-unit 1/256 (", "--depth-unit mm (")),
         (cv2.applyColorMap(np.uint8(255 * DEPTH / DEPTH.max()), cv2.COLORMAP_JET), ("a picture in colour",)),

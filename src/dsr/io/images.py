@@ -94,15 +94,27 @@ def read_array(path: Path, most: int | None = None) -> np.ndarray:
 
 def expect_depth_values(path: Path, values: np.ndarray) -> np.ndarray:
     """Return the values of a depth file if they are (H, W), floats or whole numbers of 16 bits or more."""
+    what = f": {_describe_picture(values)}" if values.dtype in (np.uint8, np.uint16) else ""
     if values.ndim != 2:
-        what = ": a photo, or a picture for viewing" if values.dtype in (np.uint8, np.uint16) else ""
         raise ValueError(f"{path}: expected one channel (height x width), got shape {values.shape}{what}")
     if values.dtype.kind not in "fiu" or (values.dtype.kind in "iu" and values.dtype.itemsize == 1):
-        what = ": a picture for viewing, or disparities of an old benchmark" if values.dtype == np.uint8 else ""
         raise ValueError(
             f"{path}: expected 16-bit or floating point values, got {values.dtype} (too coarse for depth){what}"
         )
     return values
+
+
+def _describe_picture(values: np.ndarray) -> str:
+    """Describe what a picture of several channels, or of 8 bits, probably shows."""
+    if values.ndim == 2:
+        return "a picture for viewing, or disparities of an old benchmark"
+    if values.ndim == 3 and values.shape[2] == 2:
+        return "grey that is transparent in places"
+    if values.ndim != 3 or values.shape[2] not in (3, 4) or not values.size:
+        return "no map"
+    if (values[..., :3] == values[..., :1]).all():
+        return "three equal channels, a grey picture for viewing"
+    return "a picture in colour, a photo or a map coloured for viewing"
 
 
 def read_levels(path: Path) -> np.ndarray:

@@ -177,12 +177,18 @@ def tiff_pages(file: IO[bytes]) -> list[TiffPage]:
     return [page for page in pages if not page.tags.get(254, (0,))[0] & ~2 and page.tags.get(255) != (2,)] or pages
 
 
+_NOT_READ = {
+    b"#?": "Radiance HDR", b"v/1\x01": "OpenEXR", b"\x93NUMPY": "a NumPy array", b"PK\3\4": "an archive", b"PF": "PFM",
+    b"GIF8": "GIF", b"8BPS": "Photoshop", b"%PDF": "PDF", b"P7": "PAM", b"Pf": "PFM", b"\xff\x0a": "JPEG XL",
+    b"\0\0\0\x0cJXL ": "JPEG XL", b"\0\0\0\x0cjP  ": "JPEG 2000", b"\xff\x4f\xff\x51": "JPEG 2000",
+    b"FUJIFILM": "a raw photo", b"IIU\0": "a raw photo",
+}  # fmt: skip
 _BRANDS = {b"avi": "AVIF", b"hei": "HEIC", b"hev": "HEIC", b"mif": "HEIC", b"crx": "a raw photo"}
 _COMPRESSIONS = {1, 5, 6, 7, 8, 32773, 32946}  # of TIFF, which OpenCV reads
 
 
 def format_not_read(content: bytes, *, stored: bool) -> str:
-    """Return what a HEIC or TIFF file is that OpenCV cannot decode, in 8 bits or as ``stored``; empty for others."""
+    """Return what a picture is that OpenCV cannot decode, in 8 bits or as ``stored``; empty if damaged or unknown."""
     if content[4:8] == b"ftyp":
         return _BRANDS.get(content[8:11], "a video")
     if content[:2] in (b"II", b"MM") and picture_size(io.BytesIO(content)) is not None:
@@ -192,4 +198,4 @@ def format_not_read(content: bytes, *, stored: bool) -> str:
             return f"a TIFF with compression {compression}"
         if (bits > 16 and not stored) or (bits < 32 and floats):
             return f"a TIFF of {bits}-bit {'floats' if floats else 'values'}"
-    return ""
+    return next((name for magic, name in _NOT_READ.items() if content.startswith(magic)), "")
