@@ -510,8 +510,9 @@ def test_old_matrices_are_not_unpacked_to_more_than_a_file_may_have(tmp_path, mo
 @pytest.mark.parametrize(("name", "old", "new"), [
     ("", b"", b""), ("\u00fcc", "\u00fc".encode(), b"\xcf\x20"),
     ("c", (131).to_bytes(4, "little"), (181).to_bytes(4, "little")),  # the member lies before the file's start
+    ("c", bytes((20, 0, 0, 0)), bytes((20, 0, 1, 0))),  # it needs a password
 ])  # fmt: skip
-def test_archive_with_a_member_without_a_name_or_a_place_is_refused_and_nothing_unpacked(tmp_path, name, old, new):
+def test_archive_with_a_member_that_cannot_be_read_is_refused_and_nothing_unpacked(tmp_path, name, old, new):
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as file:
         file.writestr(zipfile.ZipInfo(name), b"x" * 100)
