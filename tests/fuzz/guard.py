@@ -37,6 +37,8 @@ class Watch:
             return  # the version of the project, which runs store
         if event in _NEVER:
             self.seen.append(f"{event}{arguments!r:.200}")
+        elif event == "exec" and MARK in repr((arguments[0].co_names, arguments[0].co_consts)):
+            self.seen.append(f"executes code of a file ({arguments[0]!r:.100})")
         elif event in _CHANGES or (event == "open" and _writes(*arguments)):
             self.seen += [
                 f"{event} of {path!r:.200}" for path in _paths(event, arguments) if not self._may(event, path)

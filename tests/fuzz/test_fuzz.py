@@ -61,6 +61,7 @@ BAD = {
     "leaves": (lambda place: place.canary.mkdir(), f"leaves '{MARK}' beside its folders"),
     "starts": (lambda _: subprocess.run([sys.executable, "--version"], check=True), "subprocess.Popen"),
     "imports": (lambda _: __import__("importlib").import_module(MARK), f"imports {MARK}"),
+    "runs": (lambda _: exec(f"{MARK} = 1"), "executes code of a file"),
     "reads": (lambda place: (place.input / "../../x").read_bytes(), "reads '"),
     "removes": (lambda place: (place.root.parent / "y").unlink(missing_ok=True), "os.remove of"),
     "prints": (lambda _: os.write(2, b"libpng error"), "prints libpng error"),

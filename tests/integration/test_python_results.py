@@ -32,8 +32,9 @@ CASES = {
     "stereo": ((48, 36), {"sensor": "RealSense D435"}, ["--sensor", "RealSense D435"]),
     "repeated": ((48, 36), {}, []),
     "registered": ((96, 72), {"register": True, "fill": "all"}, ["--register", "--fill", "all"]),
-    "halved": ((96, 72), {"working_size": 2, "noise": 0.01}, ["--working-size", "2", "--noise", "0.01"]),
-}
+    "halved": ((96, 72), {"working_size": 2, "noise": 0.01, "smooth": 2.0},
+               ["--working-size", "2", "--noise", "0.01", "--smooth", "2"]),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", CASES)

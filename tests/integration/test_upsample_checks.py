@@ -195,6 +195,16 @@ def test_near_frame_of_a_folder_makes_no_other_doubtful(tmp_path):
     assert upsample(folder_of(tmp_path / "near", [near, near]), "--strict", "-o", tmp_path / "out_near") == 2
 
 
+def test_resumed_folder_keeps_the_unit_of_its_first_map(tmp_path):
+    """The first map is far and shows millimetres; the second is so near that alone it would be read as metres."""
+    folder = folder_of(tmp_path / "scan", [np.full((48, 64), far, np.float32) for far in (1500, 150)])
+    out = tmp_path / "out"
+    for _ in range(2):
+        assert upsample(folder, "-o", out) == 0
+        assert [info(out / f"{number}_photo")["input_depth"]["unit"] for number in range(2)] == [0.001, 0.001]
+        shutil.rmtree(out / "1_photo")
+
+
 def test_what_most_of_the_maps_of_a_folder_show_applies_to_all_of_them(tmp_path, capsys):
     along_the_ray = DEPTH * SMALL.ray_lengths().numpy()
     wall = np.full_like(DEPTH, 3.0)  # flat however it is read: it tells nothing, and is read like the others

@@ -19,6 +19,7 @@ import lightning
 import numpy as np
 import pytest
 import safetensors.torch
+import scipy.io
 import torch
 from omegaconf import OmegaConf
 from single_files import READERS, read_capture, read_picture_file
@@ -29,6 +30,7 @@ from dsr.app.entry import run_command
 from dsr.app.training_runs import read_config
 from dsr.app.upsample.outputs import ResultFolder
 from dsr.app.upsample.stored import read_exports, read_info, read_result
+from dsr.data import matlab
 from dsr.data.download.fetching import Checksums, unpack
 from dsr.data.folder import Folder, load_scene
 from dsr.data.matlab import read_variables
@@ -497,8 +499,20 @@ def test_matrix_of_another_file_is_not_read(tmp_path, fill):
     assert refusal(tmp_path / "x.mat", read_variables, tmp_path / "x.mat")
 
 
-@pytest.mark.parametrize(("name", "old", "new"), [("", b"", b""), ("\u00fcc", "\u00fc".encode(), b"\xcf\x20")])
-def test_archive_with_a_member_without_a_name_is_refused_and_nothing_unpacked(tmp_path, name, old, new):
+def test_old_matrices_are_not_unpacked_to_more_than_a_file_may_have(tmp_path, monkeypatch):
+    path = tmp_path / "x.mat"
+    scipy.io.savemat(path, {name: np.zeros(600) for name in "abc"}, do_compression=True)
+    assert len(read_variables(path)) == 3
+    monkeypatch.setattr(matlab, "_LARGEST", 1500)
+    assert "a compressed variable without end, or too large" in refusal(path, read_variables, path)
+
+
+@pytest.mark.parametrize(("name", "old", "new"), [
+    ("", b"", b""), ("\u00fcc", "\u00fc".encode(), b"\xcf\x20"),
+    ("c", (131).to_bytes(4, "little"), (181).to_bytes(4, "little")),  # the member lies before the file's start
+    ("c", bytes((20, 0, 0, 0)), bytes((20, 0, 1, 0))),  # it needs a password
+])  # fmt: skip
+def test_archive_with_a_member_that_cannot_be_read_is_refused_and_nothing_unpacked(tmp_path, name, old, new):
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as file:
         file.writestr(zipfile.ZipInfo(name), b"x" * 100)

@@ -8,7 +8,7 @@ from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.glass import KINDS, add_glass
 from dsr.degradation.holes import Blobs, Shadows
 from dsr.degradation.noise import NOISES, GaussianMultiplicative, Kinect, TimeOfFlight
-from dsr.degradation.random_degradation import Everything
+from dsr.degradation.random_degradation import Everything, add_folds
 from dsr.geometry.camera import Camera
 from dsr.geometry.hole_size import distance_to_known, wide_holes
 from dsr.sample import Scene
@@ -20,6 +20,7 @@ WALL = torch.linspace(2, 3, 128).repeat(1, 128, 1).double()
 WALL[:, 32:64, 32:64] = 1.2
 WALL[:, 100:110, 90:100] = torch.nan
 ROOM = Scene("set", "hall", torch.rand(3, 128, 128, generator=seeded()), Camera.from_fov(60, 128, 128), WALL)
+BOX = Downsampling("box")
 SENSORS = {"gaussian": GaussianMultiplicative(0.02), "flight": TimeOfFlight(), "kinect": Kinect()}
 DEGRADATIONS = {
     **{name: lambda seed, sensor=sensor: sensor(WALL, seeded(seed)) for name, sensor in SENSORS.items()},
@@ -29,6 +30,8 @@ DEGRADATIONS = {
     },
     **{f"seen {kind}": lambda seed, kind=kind: add_glass(ROOM, seeded(seed), {kind: 1})[1] for kind in KINDS},
     "blobs": lambda seed: WALL.masked_fill(Blobs()(WALL, ROOM.camera, seeded(seed)), torch.nan),
+    "folds": lambda seed: add_folds(ROOM, seeded(seed)).depth,
+    "far beyond": lambda seed: make_sample(ROOM, 2, BOX, "disparity", GaussianMultiplicative(0.9), seed).depth_lr,
     **{
         f"everything x{scale}": lambda seed, scale=scale: Everything()(ROOM, scale, seeded(seed))[0].depth_lr
         for scale in (1, 2, 4, 8, 16)
@@ -42,8 +45,10 @@ def test_degradation_is_a_function_of_its_generator_keeps_holes_and_gives_positi
     torch.testing.assert_close(again, one, rtol=0, atol=0, equal_nan=True)
     assert not torch.equal(one.nan_to_num(), other.nan_to_num())
     assert bool((one.nan_to_num(1) > 0).all())
-    if name in (*SENSORS, "blobs", "everything x1"):
+    if name in (*SENSORS, "blobs", "folds", "everything x1"):
         assert bool(one[WALL.isnan()].isnan().all())
+    if name in ("gaussian", "flight", "folds"):
+        assert torch.equal(one.isnan(), WALL.isnan())
 
 
 @pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)

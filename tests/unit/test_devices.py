@@ -1,9 +1,9 @@
-"""Nothing is left behind on the CPU: methods, samples and metrics on a GPU, a pretended one by default.
+"""Nothing is left behind on the CPU: methods, samples, metrics and trainings on a GPU, a pretended one by default.
 
 The results have to be those of the CPU. ``DSR_DEVICE=cuda`` runs the same tests on a real GPU.
 """
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -13,16 +13,25 @@ from pretend_cuda import pretend_cuda
 from small_lpips import random_lpips
 from small_scenes import sample_of
 from torch import nn
+from torch.utils.data import default_collate
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.holes import Blobs, Shadows
 from dsr.degradation.noise import GaussianMultiplicative, Kinect, TimeOfFlight
+from dsr.degradation.random_degradation import Everything
 from dsr.inference import upsample_surface
+from dsr.methods.networks.facets_unet import FacetsUNet
+from dsr.methods.networks.msg_net import MSGNet
 from dsr.metrics import evalmde
 from dsr.metrics.catalogue import PROTOCOLS, catalogue, score_image
 from dsr.metrics.classes import compute_means, visual_metrics
 from dsr.metrics.functional import SurfacePair
-from dsr.sample import Scene
+from dsr.sample import CENTIMETRES, Scene
+from dsr.training.degradation import Degradation
+from dsr.training.module import SuperResolution
+from dsr.training.objective import DepthObjective, SurfaceObjective
+from dsr.training.patches import Patches
+from dsr.training.settings import PatchSettings
 from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError
 
@@ -104,6 +113,33 @@ def test_metrics_have_the_values_of_the_cpu(gpu, monkeypatch):
         network.to(CPU)
     np.testing.assert_allclose(found[1], found[0], rtol=1e-4)
     assert len(found[0]) > 40
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["facets", "msg_v"])
+@pytest.mark.filterwarnings("ignore:You are trying to `self.log.*")
+def test_training_step_on_a_gpu_is_that_of_the_cpu(model, gpu):
+    net, objective, everything = {
+        "facets": (FacetsUNet, SurfaceObjective(), Everything()),
+        "msg_v": (MSGNet, DepthObjective("lap1", 0.1, shading=0.1), None),
+    }[model]
+    sample, degradation = _sample(), Degradation(4, Downsampling("box"), GaussianMultiplicative(0.01))
+    scene = Scene("set", "hall", sample.rgb, sample.camera, sample.depth)
+    patches = Patches([[scene]], PatchSettings(patch=32, batch=2), degradation, everything=everything)
+    batch, found = default_collate([patches[0], patches[1]]), []
+    for device in (CPU, gpu):
+        torch.manual_seed(0)
+        module = SuperResolution(net(4), objective).to(device)
+        moved = {key: value.to(device) for key, value in batch.items()}
+        loss = module.training_step(moved, 0)
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(module.net.parameters(), 1.0)
+        module.configure_optimizers().step()
+        with torch.no_grad():
+            module.validation_step({**moved, "unit": asdict(CENTIMETRES)}, 0)
+        means = compute_means(module.metrics[0])
+        found.append([float(each.detach()) for each in (loss, norm, *means.values())])
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-3)
 
 
 @pytest.mark.parametrize("method", ["facets", "bicubic"])

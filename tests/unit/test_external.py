@@ -138,12 +138,15 @@ def test_names_follow_a_template_and_other_files_are_reported(sample, tmp_path):
         (lambda z: np.random.default_rng(0).permuted(z).reshape(z.shape), {}, r"another scene"),
         (lambda z: z, {"range_type": "inverse", "fit": "affine"}, r"hall.npy: expected values that rise"),
         (lambda z: (1000 * z).astype(np.uint16), {}, r"hall.npy: expected method.unit=mm"),
+        (lambda z: z, {"path": "nowhere"}, r"^path: expected a directory"),
+        (lambda z: z, {"file": "{seen}"}, r"^file: expected a name with"),
+        (lambda z: z, {"unit": "feet"}, r"^unit: expected"),
     ],
 )
 def test_map_that_cannot_be_right_is_refused_by_name(sample, tmp_path, change, settings, message):
     write(tmp_path, "hall.npy", change(truth(sample)))
     with pytest.raises(ValueError, match=message):
-        External(str(tmp_path), **settings)(sample)
+        External(**{"path": str(tmp_path), **settings})(sample)
 
 
 def test_two_files_of_a_scene_and_a_missing_one_are_refused(sample, tmp_path):

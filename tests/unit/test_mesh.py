@@ -136,6 +136,22 @@ def test_three_valid_pixels_of_a_square_make_a_triangle():
         assert face_normals(mesh)[0][0, 2] < 0
 
 
+def test_diagonal_follows_the_smaller_change_of_depth():
+    depth = torch.tensor([[[2.0, 2.03], [2.01, 2.0]]])
+    for values, ends in ((depth, {0, 3}), (depth.flip(-1), {1, 2})):
+        assert all(ends <= set(face) for face in triangulate(values, Camera(2, 2, 5, 5, 0.5, 0.5)).faces.tolist())
+
+
+def test_strips_of_rows_and_triangles_of_large_maps_leave_no_seam(monkeypatch):
+    depth = wall() + 0.1 * torch.rand(1, 30, 40, generator=torch.Generator().manual_seed(0))
+    whole = triangulate(depth, CAMERA)
+    normals = vertex_normals(whole)
+    monkeypatch.setattr("dsr.geometry.mesh._STRIP", 70)
+    strips = triangulate(depth, CAMERA)
+    np.testing.assert_array_equal(strips.faces, whole.faces)
+    np.testing.assert_allclose(vertex_normals(strips), normals, atol=1e-6)
+
+
 @pytest.mark.parametrize("stride", [1, 2, 7])
 def test_vertices_are_the_back_projected_pixels_of_every_which_row_and_column(stride):
     depth = wall() + 2e-4 * torch.arange(1200).view(1, 30, 40)

@@ -209,6 +209,15 @@ def test_variants_choose_among_the_lights_image_by_image(variant):
     exactly(metric.compute(), chosen[variant].mean())
 
 
+def test_masked_pixels_do_not_count_and_rays_of_one_camera_serve_a_batch():
+    pair = _ramp(0, batch=2)
+    mask = torch.rand(pair.target.shape, generator=torch.Generator().manual_seed(0)) < 0.5
+    expected = functional.rmse_d(SurfacePair(*pair.given, pair.rays, mask)).mean()
+    for camera in (CAMERA, CAMERA.rays()):
+        exactly(RMSEd()(pair.prediction, pair.target, camera, mask), expected)
+    assert not torch.allclose(expected, functional.rmse_d(pair).mean(), rtol=1e-3)
+
+
 def test_images_that_cannot_be_scored_are_left_out():
     for make in (RMSEd, DSSIMv):
         metric, alone = make(), make()

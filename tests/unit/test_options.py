@@ -62,6 +62,7 @@ def test_wrong_value_is_named_as_a_flag_and_as_an_argument(words, name, wrong, m
     ("words", "message"),
     [
         ("--set k", "--set k: expected KEY=VALUE"),
+        ("--noise 1 --set noise=1", "--noise: expected it once, got --set noise=1, too"),
         ("--depth-unit ell", "--depth-unit: expected m, cm, mm or "),
         ("--extrinsics m.txt", "--extrinsics: expected --depth-camera with it"),
         ("--for robot --fill small", "--for robot: expected --fill none or none with it, got --fill small"),

@@ -268,6 +268,17 @@ def test_min_max_lies_between_the_patchs_and_the_scenes_and_half_are_the_scenes(
     assert between.std() == pytest.approx(12**-0.5, abs=0.05)  # of a uniform distribution
 
 
+def test_min_max_of_a_noisy_patch_contains_its_low_resolution_map_and_often_is_the_clean_scenes():
+    patches = Patches([[_scene()]], _settings(), Degradation(4, BOX, GaussianMultiplicative(0.1)))
+    coarse = 10 * (1 / _tilted(CAMERA)).reshape(11, 4, 15, 4).mean(dim=(1, 3))
+    clean = 0
+    for patch in (patches[i] for i in range(60)):
+        (low, high), own = patch["min_max"].flatten().tolist(), patch["disparity_lr"]
+        assert low - 1e-5 <= float(own.min()) <= float(own.max()) <= high + 1e-5
+        clean += [low, high] == pytest.approx([float(coarse.min()), float(coarse.max())], rel=1e-5)
+    assert clean > 15
+
+
 def test_min_max_of_a_whole_scene_is_its_low_resolution_maps_and_that_of_a_wall_has_width():
     whole = WholeScenes([_scene()], X4)[0]
     assert whole["min_max"].flatten().tolist() == pytest.approx(

@@ -215,6 +215,11 @@ def test_aligned_pairs_are_left_alone(seed, noisy):
     assert not found.visible
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_photo_of_something_else_moves_nothing(scene, seed):
+    assert not find_displacement(displaced(world(seed)[1]), scene[0]).certain
+
+
 def test_shift_along_edges_stays_unknown():
     photo = torch.zeros(3, SIZE, SIZE)
     inverse = np.ones((SIZE, SIZE))
