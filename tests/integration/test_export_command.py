@@ -7,6 +7,8 @@ import trimesh
 from small_frames import write_frames
 from upsampling import refused_line, upsample
 
+from dsr.app.upsample import run
+
 
 @pytest.fixture
 def capture(tmp_path):
@@ -46,10 +48,14 @@ def test_frames_without_poses_are_refused_before_anything_is_computed(capture, t
     assert not (tmp_path / "out").exists()
 
 
-def test_poses_of_a_file_are_those_of_the_exports(capture, tmp_path):
+def test_poses_of_a_file_are_those_of_the_exports_whichever_frame_ends_first(capture, tmp_path, monkeypatch):
+    in_order = run.work_through
+    monkeypatch.setattr(run, "work_through", lambda *arguments: reversed(list(in_order(*arguments))))
     (tmp_path / "poses.txt").write_text("".join(f"{number} {number} 2 3 0 0 0 1\n" for number in range(2)))
     out = tmp_path / "out"
-    assert upsample(capture, "--only", "nerfstudio,gaussian", "--poses", tmp_path / "poses.txt", "-o", out) == 0
+    assert upsample(capture, "--only", "open3d,nerfstudio,gaussian", "--poses", tmp_path / "poses.txt", "-o", out) == 0
+    rows = (out / "open3d/trajectory.log").read_text().splitlines()  # the n-th is that of the n-th photo
+    assert [row.split()[3] for row in (rows[1], rows[6])] == ["0", "1"]
     frames = json.loads((out / "transforms.json").read_text())["frames"]
     assert [[row[3] for row in entry["transform_matrix"][:3]] for entry in frames] == [[0, 2, 3], [1, 2, 3]]
     assert {"cameras.txt", "images.txt", "points3D.txt"} <= names_in(out / "gaussian/sparse/0")

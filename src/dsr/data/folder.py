@@ -8,7 +8,7 @@
                                              of view, disparity in its own pixels
               depth_lr4.*, disparity_lr4.*   the same, whose size has to be that of the factor in its name, here 4
 
-Depth and disparity follow ``camera.json``; see :func:`dsr.io.cameras.read_camera` for its keys.
+Depth and disparity follow ``camera.json``, whose keys are in docs/data.md.
 """
 
 from __future__ import annotations

@@ -169,8 +169,8 @@ class FrameSequence:
             raise ValueError(f"--neighbours: expected a pose for each frame, {where}")
         if picture.pose is None and self._file is not None:
             missing = len(self._places) - len(self._poses or ())
-            text, detail = f"{self._file.name} has no pose of this frame", f"of {len(self._places)} frames have none"
-            notes.append(Assumption(text, f"{missing} {detail}", "poses-missing", missing))
+            detail = f"{missing} of {len(self._places)} frames have none"
+            notes.append(Assumption(f"{self._file.name} has no pose of this frame", detail, "poses-missing", missing))
         picture = replace(picture, assumptions=tuple(notes))
         if not self._count:
             return picture

@@ -117,7 +117,8 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
             problems.setdefault(done.problem, []).append(done.pair.name)
     lines = [f"{_listed(names)}: {message}" if len(pairs) > 1 else message for message, names in problems.items()]
     if finished and wanted.of_all and not wanted.dry_run and shard is None:
-        folders = {done.pair.name: done.target for done in finished}
+        folders = {done.pair.name: done.target for done in finished}  # as workers ended, which is not the frames' order
+        folders = {pair.name: folders[pair.name] for pair in pairs if pair.name in folders}
         exports, failures = write_scene(wanted.output, folders, wanted.of_all, overwrite=wanted.overwrite)
         for part, path in exports.items():
             show(console, f"{part}: {len(folders)} frames -> {path}")

@@ -170,8 +170,11 @@ def _export_geometry(matrices: list[Path], path: Path, size: Size) -> Geometry:
     numbers = [read_numbers(each, 16)[[0, 5, 2, 6]].tolist() for each in matrices]
     for place, each in enumerate(numbers):
         with contextlib.suppress(ValueError):  # it is of other pixels
-            return with_pose(fitting_camera(str(matrices[place]), (size,), each), path)
-    return with_pose(fitting_camera(str(matrices[0]), (size, _SIZE), numbers[0]), path)
+            camera = fitting_camera(str(matrices[place]), (size,), each)
+            break
+    else:
+        camera = fitting_camera(str(matrices[0]), (size, _SIZE), numbers[0])
+    return with_pose(camera, path)
 
 
 def with_pose(camera: Camera | None, path: Path, notes: tuple[Assumption, ...] = ()) -> Geometry:
