@@ -39,7 +39,7 @@ from dsr.training.objective import DepthObjective, Objective
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings
 from dsr.utils.checkpoints import BestCheckpoint
-from dsr.utils.lightning import fit
+from dsr.utils.checkpoints import fit
 
 SCALE = 4
 
