@@ -48,7 +48,7 @@ USAGE_ERRORS = {
     "output_dir=a=b": "output_dir=a=b: expected KEY=VALUE",
     "method=msg,msg_v": "method: expected one value, got several; ",
     "--config-name=other": ".*'other'",
-    "--config-dir=nowhere": ".*nowhere",
+    "--config-dir=nowhere": "--config-dir: expected a directory, got nowhere",
     "+experiment=papers": "experiment=papers: unknown; expected one of all_methods, ",
     "experiment=paper_tables": r"experiment: expected .* \+experiment=",
     "trainer=smoke": "trainer: expected ",

@@ -30,7 +30,7 @@ from torch import Tensor, nn
 
 from dsr.methods.images import normalise_imagenet
 from dsr.methods.networks.peers.peer import Peer
-from dsr.methods.networks.peers.peer_network import read_tensors
+from dsr.methods.networks.peers import read_tensors
 from dsr.methods.recipe import Run, read_recipe
 
 TRAINING_ONLY = (

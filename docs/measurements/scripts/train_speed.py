@@ -29,7 +29,7 @@ from lightning.pytorch.callbacks import Callback
 from torch import nn
 
 from dsr.app.schema import TrainConfig, plain_config, register
-from dsr.app.train import _prepare, find_processes
+from dsr.app.train import _Training, find_processes
 from dsr.data.rendered import SimGeo
 from dsr.degradation.downsampling import Downsampling
 from dsr.methods.networks.msg_net import MSGNet
@@ -39,7 +39,7 @@ from dsr.training.objective import DepthObjective, Objective
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings
 from dsr.utils.checkpoints import BestCheckpoint
-from dsr.utils.lightning import fit
+from dsr.utils.checkpoints import fit
 
 SCALE = 4
 
@@ -140,7 +140,7 @@ def profile(steps: int, device: torch.device, overrides: Sequence[str]) -> None:
     times = StepTimes(device)
     with tempfile.TemporaryDirectory() as folder:
         plain["output_dir"] = folder
-        prepared = _prepare(plain, TrainConfig.of(plain), device, find_processes(device, 1))
+        prepared = _Training(plain, TrainConfig.of(plain), device, find_processes(device, 1))
         trainer, module, data = prepared.trainer, prepared.module, prepared.data
         data.setup()
         without = [each for each in trainer.callbacks if not isinstance(each, BestCheckpoint)]  # type: ignore[attr-defined]

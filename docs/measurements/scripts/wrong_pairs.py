@@ -28,7 +28,7 @@ from dsr.degradation.downsampling import scene_generator
 from dsr.degradation.random_degradation import Everything
 from dsr.geometry.agreement import depth_outlines, find_misplaced, judge, photo_outlines, reduce_photo, significances
 from dsr.geometry.camera import Camera
-from dsr.io.encoding import Encoding
+from dsr.io.depth_files import Encoding
 from dsr.io.inputs import Picture
 from dsr.notes import LIMITS
 from dsr.sample import AllHolesError, Scene

@@ -129,7 +129,11 @@ def fail(message: str) -> NoReturn:
 def _damaged_file() -> str:
     """Return why the user's configuration files cannot be read, one line; empty if they can."""
     folder = get_args_parser().parse_known_args(sys.argv[1:])[0].config_dir
-    for path in sorted(Path(folder).glob("*/*.yaml")) if folder is not None else ():
+    if folder is None:
+        return ""
+    if not Path(folder).is_dir():
+        return f"--config-dir: expected a directory, got {folder}"
+    for path in sorted(Path(folder).glob("*/*.yaml")):
         try:
             OmegaConf.load(path)
         except Exception as error:  # damaged YAML raises many types

@@ -221,9 +221,8 @@ class _Training:
             precision="bf16-mixed" if settings.precision == "bfloat16" else "32-true",
             default_root_dir=folder,
         )
-        self.tolerated = (
-            ("results_version", "scenes_version", "outside_code", "device") if "resume" in given_keys() else ()
-        )
+        resumable = ("results_version", "scenes_version", "outside_code", "device")
+        self.tolerated = resumable if "resume" in given_keys() else ()
         self.resume = folder / _LAST if (folder / _LAST).is_file() and not settings.overwrite else None
         self.plain, self.settings, self.identity, self.folder = plain, settings, identity, folder
         self.data, self.module, self.trainer, self.best, self.progress = data, module, trainer, best, progress
@@ -236,10 +235,8 @@ class _Training:
             if (folder / WEIGHTS).exists() and not settings.overwrite:
                 raise ConfigError(f"output_dir: {folder / WEIGHTS} is trained already; overwrite=true trains it again")
         held_out = ", ".join(f"{len(names)} of {kind}" for kind, (_, names) in data.held_out.items())
-        count, parameters = (
-            sum(len(names) for _, names in data.trained),
-            sum(p.numel() for p in module.net.parameters()),
-        )
+        count = sum(len(names) for _, names in data.trained)
+        parameters = sum(each.numel() for each in module.net.parameters())
         patch, several = data.patches.patch, f" x {settings.accumulate} batches" if settings.accumulate > 1 else ""
         several += f" x {trainer.world_size} devices" if trainer.world_size > 1 else ""
         logs = (f"tensorboard --logdir {folder}" if name == "tensorboard" else name for name in settings.logger)
@@ -262,9 +259,7 @@ class _Training:
         with rundir.at_work(folder, self.plain, self.identity, self.tolerated, alone=True) as changed:
             for key in changed:
                 self.progress.say(f"note: the run began with another {key}")
-            if (
-                settings.overwrite
-            ):  # so that nothing of the earlier training is taken for this one's if it is interrupted
+            if settings.overwrite:  # nothing of the earlier training is taken for this one's if it is interrupted
                 (folder / WEIGHTS).unlink(missing_ok=True)
                 for name in ("checkpoints", "tensorboard", "csv", "wandb"):
                     shutil.rmtree(folder / name, ignore_errors=True)
@@ -306,13 +301,11 @@ class _Training:
             kept = folder / _LAST.with_name(f"{settings.keep}.ckpt")
             checkpoint = read_torch_file(kept)
             state, prefix = checkpoint["state_dict"], "average."
-            self.module.average.load_state_dict(
-                {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
-            )
+            average = {name.removeprefix(prefix): each for name, each in state.items() if name.startswith(prefix)}
+            self.module.average.load_state_dict(average)
+            facts["steps"] = checkpoint["global_step"]
             with replacing(folder / WEIGHTS) as temporary:
-                save_network(
-                    temporary, self.module.average, facts["model"], {**facts, "steps": checkpoint["global_step"]}
-                )
+                save_network(temporary, self.module.average, facts["model"], facts)
         self.progress.say(f"weights: {folder / WEIGHTS}")
         score = self.best.best_model_score if settings.keep == "best" else trainer.callback_metrics.get(MONITOR)
         return math.nan if score is None else float(score)

@@ -1,4 +1,4 @@
-"""Triangle meshes of depth maps, cut at depth steps, and fewer triangles and points for those beyond a limit.
+"""Triangle meshes of depth maps, cut at depth steps, with fewer triangles beyond a limit; and one mesh of many maps.
 
 Neighbouring pixels lie on different sides of a step if inverse depth, which is linear on a plane, changes by more than
 the slopes on both sides predict, over windows of up to five pairs of pixels. With a tolerance, flat parts get large

@@ -117,9 +117,9 @@ def group(record: Callable[[], Any] | None = None, title: str = "") -> Any:
     Without ``record`` it may be left out: all options that it requires are given, or none of its options.
     """
     metadata = {_KEY: _Option(title, group=True)}
-    return (
-        field(default=None, metadata=metadata) if record is None else field(default_factory=record, metadata=metadata)
-    )
+    if record is None:
+        return field(default=None, metadata=metadata)
+    return field(default_factory=record, metadata=metadata)
 
 
 def _options_of(record: type) -> Iterator[_Option]:

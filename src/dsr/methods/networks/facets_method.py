@@ -188,10 +188,11 @@ def _describe_noise(given: Tensor, answer: Answer) -> MapNoise:
     error = (error - (error * known).sum() / count) * known
     variance = error.square().sum() / count
     depth = given[given.isfinite()].median().reciprocal()
+    least = max(float(variance), 1e-20)
     before, extent = 1.0, 2.0 * 16  # the full width at half maximum of the correlation of neighbours, in pixels
     for step in range(1, min(16, error.shape[-1])):
         both = (known[..., step:] * known[..., :-step]).sum().clamp(min=1)
-        now = float((error[..., step:] * error[..., :-step]).sum() / both) / max(float(variance), 1e-20)
+        now = float((error[..., step:] * error[..., :-step]).sum() / both) / least
         if now < 0.5:
             extent = max(1.0, 2 * (step - 1 + (before - 0.5) / max(before - now, 1e-6)))
             break
