@@ -1,7 +1,5 @@
 """The command ``dsr``, which is ``python -m dsr``."""
 
-from __future__ import annotations
-
 from typing import NoReturn
 
 from dsr.utils.interruption import start

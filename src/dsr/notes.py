@@ -1,7 +1,5 @@
 """Notes on input: assumptions that were made, and warnings of implausible values, with the limits of all warnings."""
 
-from __future__ import annotations
-
 import inspect
 import re
 import warnings

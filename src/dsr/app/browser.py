@@ -5,8 +5,6 @@ ends in a line on the page. The page's address contains a token, which other acc
 not know; its content security policy forbids the browser to ask any other server.
 """
 
-from __future__ import annotations
-
 import contextlib
 import html
 import os

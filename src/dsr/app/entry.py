@@ -5,8 +5,6 @@ been composed and checked, so that a mistyped argument is reported immediately. 
 job begins if one of its jobs cannot be run, with a line for each of these.
 """
 
-from __future__ import annotations
-
 import copy
 import importlib
 import os

@@ -3,8 +3,6 @@
 The docstring of a record is the text of its command's ``--help`` before the options.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The commands behind ``dsr view`` and ``dsr fuse``: one page, or one mesh, of results of ``dsr upsample``."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import webbrowser

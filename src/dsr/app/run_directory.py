@@ -4,8 +4,6 @@ A name consists of the method or model, the scale, in evaluations the data set, 
 the settings that the command line overrides, and the seed: ``msg_v_x8_w0.72_seed0``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """The configuration: what its keys are, which values they take, and how it is composed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass

@@ -1,7 +1,5 @@
 """The command behind ``train.py``: seed, network, data, module, callbacks, loggers, trainer; fit; write the weights."""
 
-from __future__ import annotations
-
 import contextlib
 import fnmatch
 import functools

@@ -5,8 +5,6 @@ who types one, or keeps it in a directory of their own (``--config-dir``), decid
 not. In each group it may name the targets that the group's files in dsr's own ``conf`` name. Others need ``trust``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

@@ -3,8 +3,6 @@
 A shell's script asks ``dsr completion --line LINE`` for the words that may stand at the end of the line.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import shlex

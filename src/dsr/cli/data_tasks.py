@@ -1,7 +1,5 @@
 """The tasks of ``dsr data``; separate from its options, which are parsed without importing them."""
 
-from __future__ import annotations
-
 import sys
 import textwrap
 from collections.abc import Mapping

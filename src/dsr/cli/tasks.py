@@ -1,7 +1,5 @@
 """``dsr study`` and ``dsr export``: ask people which rendering looks best, and write a network as an ONNX file."""
 
-from __future__ import annotations
-
 from rich.console import Console
 
 import dsr

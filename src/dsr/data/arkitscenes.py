@@ -14,8 +14,6 @@ data, too, where they alone have ``highres_depth``. Depth 0 is a hole. Intrinsic
 to the raw data; where there are none, 60 degrees of horizontal view are assumed. Photos stay as the camera was held.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

@@ -28,8 +28,6 @@ Regions of all are ``glass``, the mask of the objects, ``outside``, all the rest
 :data:`EDGE` pixels of the mask's outline, on either side.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

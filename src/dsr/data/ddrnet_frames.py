@@ -10,8 +10,6 @@ github.com/neycyanshi/DDRNet.
 The camera is that of the authors' losses (src/losses.py), taken as it is: pixel centres at integers.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from dsr.data.frame_files import find_beside, name_of, read_frame

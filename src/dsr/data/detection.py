@@ -4,8 +4,6 @@ A module of this package whose frames are detected has ``DETECTED``: for each ki
 files below a directory, by name, one that loads the scene of such files, and the name of the data set.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib
 import itertools

@@ -13,8 +13,6 @@ is the level and every level, even some below 0 which interpolation may make, ha
 Middlebury 1.3 m and 3.0 m, with the camera of 2005 and 2006, three levels to a pixel, and the shift of Art.
 """
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -11,8 +11,6 @@
 Depth and disparity follow ``camera.json``, whose keys are in docs/data.md.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

@@ -1,7 +1,5 @@
 """Functions that several readers use: numbers and pictures from files, and checks whose errors name the file."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -12,8 +12,6 @@ test. As the archive ``_dataset_processed.zip`` has them, by the loaders of othe
 likewise ``depth_tof`` and ``depth_l515``. Sequences such as ``scene12_traj1_naked_1`` lack the objects.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Literal, get_args

@@ -17,8 +17,6 @@ or, with the same in it, as pictures, a folder for each:
 Regions are ``planes``, numbered from 1 (walls, then tables, then floors), and ``edges``, lines of a pixel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -12,8 +12,6 @@ are spread over the trajectories; ``dataset.frames`` takes others.
 All are 640 x 480 of one camera, 481.20, -480.00, 319.50, 239.50.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

@@ -3,8 +3,6 @@
 SciPy reads version 5, too, but a damaged file can crash the whole process there.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 import zlib

@@ -19,8 +19,6 @@ Formats as on vision.middlebury.edu/stereo/data: disparity d in pixels of the le
   is assumed to be the one of 2003.
 """
 
-from __future__ import annotations
-
 import functools
 import re
 from collections.abc import Collection, Mapping, Sequence

@@ -14,8 +14,6 @@ Networks for Joint Image Filtering", IJCV 2021), 640 x 480 pixels with the borde
 al., CVPR 2022) has the latter as files, ``RGB/1000.jpg`` and ``Depth/1000.npy`` in metres, numbered from 0.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -17,8 +17,6 @@ second camera does not see.
 equation given the contours, with free boundaries at holes and at edges of surfaces, where levels jump.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

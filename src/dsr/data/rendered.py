@@ -4,8 +4,6 @@ The paper's sixth scene, Lucy, replaces the statue where ``root/lucy`` holds it 
 :mod:`dsr.data.folder`. Renderings are cached, see :func:`dsr.synthetic.cache_directory`.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Iterable, Sequence

@@ -17,8 +17,6 @@ are also in circulation, with DCTNet (Zhao et al., CVPR 2022), as
 No camera is published; 60 degrees of horizontal view are assumed.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal

@@ -4,8 +4,6 @@ The name of a cached file contains a hash of the scene's files, the settings, an
 a change of any of them prepares the scene again.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib

@@ -13,8 +13,6 @@ Both binary files are little-endian and start with the number 202021.25 as a flo
 (int32) and the depths row by row (float32), a .cam the 3 x 3 intrinsics and the 3 x 4 pose (float64).
 """
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 from types import MappingProxyType

@@ -13,8 +13,6 @@ the board: that of the plane where the pixel's ray, bent by the lens, meets it. 
 camera has no lens, so that planes are bent in it by up to 4.5 mm, the truth's and the map's alike.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType

@@ -13,8 +13,6 @@ is, pixel centres at integers from 0, which is right for NYU's frames; the toolb
 the principal point is uncertain by one pixel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType

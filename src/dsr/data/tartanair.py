@@ -8,8 +8,6 @@ or both files in one folder. Pictures are 640 x 480; depth is orthogonal, float3
 metres in the sky. The camera is the same throughout: f = 320, centre (320, 240) in pixels, taken as it is published.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -12,8 +12,6 @@ is the caller's to give. No file holds a camera: :data:`ESTIMATED` fits 72 corre
 the paper's authors published with a camera, to a root mean square error of 0.95 pixels.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path

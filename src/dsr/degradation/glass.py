@@ -5,8 +5,6 @@ sees the virtual image. The shares drawn here are wider than those of ClearGrasp
 D435), where 28 to 65 % of an object's pixels are missing. Shapes are seen along parallel rays.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

@@ -4,8 +4,6 @@ A kind of holes is a callable from a low-resolution map, its camera and a genera
 :func:`dsr.degradation.downsampling.make_sample`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ A noise model states the range type that it acts on, and maps low-resolution val
 brightness of the photo and of a generator.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

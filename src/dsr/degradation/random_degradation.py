@@ -10,8 +10,6 @@ A degradation is drawn in three stages, each kind with its share:
 All random numbers come from one generator. Maps are inverse depth, in which planes are linear, in 1/m.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

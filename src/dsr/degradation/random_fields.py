@@ -1,7 +1,5 @@
 """Random numbers and fields from an explicit generator."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

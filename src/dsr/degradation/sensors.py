@@ -5,8 +5,6 @@ length, disparity and noise in pixels scale with it, so that the errors in metre
 source of each figure.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from typing import Literal, NamedTuple

@@ -1,7 +1,5 @@
 """``dsr doctor``: checks of what is installed, and of scenes' depth maps and cameras, with advice."""
 
-from __future__ import annotations
-
 import platform
 import shutil
 import subprocess

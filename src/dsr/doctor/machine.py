@@ -1,7 +1,5 @@
 """Checks of what is installed and of the machine: ``dsr doctor`` without a directory."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import platform

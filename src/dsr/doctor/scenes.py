@@ -6,8 +6,6 @@ slope of a smooth surface changes by one unit from pixel to pixel. Values that w
 longer multiples, but along a slope they are still exactly equal for some pixels and then step.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable

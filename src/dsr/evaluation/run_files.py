@@ -3,8 +3,6 @@
 Only files are read: ``scores.csv``, ``summary.json``, ``versions.json``, predictions and stored scenes.
 """
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence

@@ -7,8 +7,6 @@ negative depths are stored as they come and count as missing; a prediction witho
 stored config equals the requested one is reused, so that an interrupted run continues where it stopped.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

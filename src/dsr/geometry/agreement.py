@@ -7,8 +7,6 @@ for all cyclic displacements of the photo at once; slow changes over displacemen
 around no displacement, in standard deviations of the same over all other displacements, is the significance.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, TypeVar
 

@@ -1,7 +1,5 @@
 """Pixels and those around them: distances to measured ones, wide holes, largest values of windows."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -4,8 +4,6 @@ A direction is a unit vector from the surface to the light in the camera frame: 
 pictures, the pages' scripts and the command lines take names and directions from here.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

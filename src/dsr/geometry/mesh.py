@@ -8,8 +8,6 @@ Meshes are simplified by quadric edge collapses (Garland and Heckbert, SIGGRAPH 
 `fast-simplification` (the extra ``mesh``); without it, rows and columns are left out.
 """
 
-from __future__ import annotations
-
 import importlib
 import math
 from collections.abc import Callable, Iterable

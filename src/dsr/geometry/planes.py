@@ -7,8 +7,6 @@ estimates k. Windows with a good fit are planar and vote. Disparity and inverse 
 plane themselves, and their reciprocals are not.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Literal, NamedTuple
 

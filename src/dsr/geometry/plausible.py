@@ -1,7 +1,5 @@
 """Implausible and impossible cameras, baselines and distances: the checks that all commands share."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from typing import Literal, NamedTuple

@@ -6,8 +6,6 @@ poses as given, under each of :data:`READINGS`, other conventions and units, and
 informative the frames are.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence

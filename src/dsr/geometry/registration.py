@@ -6,8 +6,6 @@ refined to fractions of a pixel. A displacement counts only if the gain is signi
 the image; a change of scale only if it gains beyond the best shift.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass

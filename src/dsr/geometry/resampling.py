@@ -10,8 +10,6 @@ with a z-buffer, so surfaces have no pinholes at any ratio of the resolutions. P
 border cover the square of their own area instead, continued at the slope of their surface.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Normals of a depth map, and renderings: under the paper's four lights, and under a softer one for pictures."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Upsampling of one photo's depth: low-resolution map in, high-resolution map out."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

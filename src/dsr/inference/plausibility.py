@@ -7,8 +7,6 @@ angular distance from the nearest measured pixel. This is a rough estimate, whic
 their errors.
 """
 
-from __future__ import annotations
-
 import math
 
 import cv2

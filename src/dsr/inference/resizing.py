@@ -7,8 +7,6 @@ two steps, x8 and then x4 on the result averaged to a quarter of the photo's siz
 docs/measurements/facets.md.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

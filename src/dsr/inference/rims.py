@@ -9,8 +9,6 @@ which knows slopes and its own errors, if filling from the rim gives the same su
 of the other surface counts in its expected error. See ``docs/measurements/scripts/holes.py`` for the figures.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -7,8 +7,6 @@ single reading on which no other frame agrees gives way to several that agree wi
 most of the frames that see something there agree on.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass

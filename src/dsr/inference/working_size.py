@@ -9,8 +9,6 @@ window, whatever its size. The flattest tenth of the windows counts. A surface t
 same; but a sensor's noise is never as smooth, since depth is counted in steps, and no window is free of it.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple, TypeVar
 

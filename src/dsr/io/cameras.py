@@ -3,8 +3,6 @@
 Warnings of implausible cameras, baselines and distances follow the rules of ``dsr doctor``.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass, fields, replace

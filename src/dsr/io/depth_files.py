@@ -4,8 +4,6 @@ First the values as they are stored, then what they stand for: holes, unit and r
 :mod:`dsr.io.units` identifies the unit.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

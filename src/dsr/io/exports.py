@@ -5,8 +5,6 @@ viewer, and the photo as their texture (Khronos, glTF 2.0 specification, section
 bits and normals of 8 (``KHR_mesh_quantization``), of which a node's scale and translation make metres.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """A photo and a depth map by their paths, as arrays: ``dsr.read`` and ``dsr.read_depth``."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ A reader in :mod:`dsr.io.captures` makes a :class:`~dsr.io.pairs.Pair` of each f
 opened is stated in its :class:`Geometry`; what is in a file of each frame is read with the frame.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

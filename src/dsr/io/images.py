@@ -1,7 +1,5 @@
 """Pictures, maps of numbers, and numbers in text from files; errors name the file."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import math

@@ -1,7 +1,5 @@
 """Reading of a pair of files as rgb in [0, 1] and depth in metres, with the assumptions that this needed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

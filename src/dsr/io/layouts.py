@@ -7,8 +7,6 @@ side by side, distinguished by their names or contents. To these a model of COLM
 poses. Of photos beside a model without depth maps, its points are the depth.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

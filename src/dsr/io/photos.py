@@ -4,8 +4,6 @@ Decoders of HEIC turn a photo as its properties ``irot`` and ``imir`` say (ISO/I
 https://github.com/strukturag/libheif), whatever its EXIF data say.
 """
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import io

@@ -1,7 +1,5 @@
 """Options about input files: units, cameras, poses; checked before the readers are imported, which takes seconds."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass

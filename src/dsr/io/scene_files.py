@@ -4,8 +4,6 @@ dsr's cameras have x right, y down, z forward, and pixel centres at integers, as
 principal point from the corner of the image, half a pixel more.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import shutil

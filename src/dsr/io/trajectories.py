@@ -1,7 +1,5 @@
 """Poses of frames and transforms between cameras: from text and JSON files, and from captures."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence

@@ -5,8 +5,6 @@ single pixels as of a laser scanner, and the planes of the map (:func:`dsr.geome
 different values shows nothing but its median.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple, NoReturn
 
 import numpy as np

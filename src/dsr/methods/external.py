@@ -4,8 +4,6 @@ A monocular network's map has no scale, and often no shift. Such a map is fitted
 without the truth, in its own quantity: relative inverse depth, as of MiDaS and Depth Anything, in inverse depth.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -7,8 +7,6 @@ pixel by 26 such features, on a grid of at most 320 x 320 pixels. It was trained
 objects of :mod:`dsr.degradation.glass`, 6 to 70 % as wide as the grid.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from pathlib import Path

@@ -3,8 +3,6 @@
 While a network is exported to ONNX, some of them do the same in another way: in a graph no size depends on values.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Sequence

@@ -9,8 +9,6 @@ The field's ways, of which an evaluation takes one (``metrics.alignment``):
   2025; microsoft/MoGe 0744441 solves it for 64 x 64 pixels, here all count, by reweighted least squares).
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -11,8 +11,6 @@ An edge is a pair of pixels whose depths have a ratio above a threshold, found i
 Unknown truth is left out of both maps. Holes of a prediction have no edges, so ``Boundary_covered`` belongs to scores.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from functools import partial

@@ -8,8 +8,6 @@ Ilg et al., ECCV 2018, with the subsets of mattpoggi/mono-uncertainty (543772b),
 by the mean error.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

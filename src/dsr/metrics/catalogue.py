@@ -1,7 +1,5 @@
 """The catalogue of metrics, and the scores of all of them for a pair of depth maps."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial

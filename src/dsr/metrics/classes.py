@@ -4,8 +4,6 @@ They are updated with (prediction, target, camera) or with a SurfacePair; a coll
 renderings once for all of its metrics.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

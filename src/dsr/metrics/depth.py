@@ -15,8 +15,6 @@
 Depth is neither capped nor cropped. Missing predictions are left out; the fractions ``covered`` stand beside the means.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import torch

@@ -10,8 +10,6 @@ WKDR is of all pairs of pixels, of which theirs draws 10^7 without a seed; Sobol
 Pixels without a truth are left out. Holes of a prediction count as errors, except for false edges, which they spare.
 """
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 

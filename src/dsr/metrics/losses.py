@@ -5,8 +5,6 @@ renderings, with the metrics' own kernels: MSE_v (Voynov et al. 2019), and DSSIM
 means over the lights in place of the worst, because the gradient of a maximum is that of one light alone.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ Zhang et al., *The Unreasonable Effectiveness of Deep Features as a Perceptual M
 with torchmetrics. The trunk is torchvision's ImageNet AlexNet, found by :func:`find_trunk`.
 """
 
-from __future__ import annotations
-
 import http.client
 import importlib.metadata
 import socket

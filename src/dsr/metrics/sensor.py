@@ -10,8 +10,6 @@
 ``Sensor_covered`` and ``Plane_covered``, the fractions of scored pixels, belong to every score.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import torch

@@ -11,8 +11,6 @@ All are of one sequence, (), and lower is better. None knows whether the depth i
 but the last. Holes are left out, and :func:`covered` stands beside them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

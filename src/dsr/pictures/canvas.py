@@ -1,7 +1,5 @@
 """A figure whose pictures are placed in inches, how figures are written, and a row of pictures for a notebook."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path

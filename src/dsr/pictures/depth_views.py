@@ -1,7 +1,5 @@
 """Views of a depth map for pictures: normals, renderings, colour range, reduction, the window of largest values."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

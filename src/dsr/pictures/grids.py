@@ -1,7 +1,5 @@
 """Layout of the grids: rows of panels of one width, details below them, and one colour bar per row."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass

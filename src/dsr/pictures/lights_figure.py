@@ -1,7 +1,5 @@
 """Figure of the four lights: a sphere and a surface under each."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

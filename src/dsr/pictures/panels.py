@@ -1,7 +1,5 @@
 """The pictures of a result: depth, renderings and errors of an evaluation, expected errors, and before and after."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

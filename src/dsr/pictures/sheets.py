@@ -1,7 +1,5 @@
 """Contact sheets: one row per scene of a data set, to check that it was read correctly."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import textwrap

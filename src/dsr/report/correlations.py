@@ -5,8 +5,6 @@ point; correlations are Pearson's and Spearman's. Beside them stand those of the
 scatter matrix has pairs of metrics below the diagonal, correlations above, densities per method on it.
 """
 
-from __future__ import annotations
-
 import colorsys
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ A scalar's step is what it is plotted over: the number of the scene, or of the l
 number is which scene. Each data set has charts of its own, so that scenes of different ones do not share a place.
 """
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

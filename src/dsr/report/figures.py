@@ -6,8 +6,6 @@ the ground truth on average, and the input is rendered at its own resolution. Th
 percentile of the ground truth, those of errors the 98th of all methods' absolute errors, each across a row.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Self-contained HTML pages without network access: their templates, scripts, styles and embedded data."""
 
-from __future__ import annotations
-
 import base64
 import functools
 import hashlib

@@ -3,8 +3,6 @@
 It has scores, published values, times, settings and links; :mod:`dsr.report.page_scenes` makes its pictures.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence

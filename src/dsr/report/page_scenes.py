@@ -12,8 +12,6 @@ The page computes renderings, colours and readouts itself from stored values:
 Over all scenes of a benchmark setting, the expected errors stand beside the measured ones.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import math

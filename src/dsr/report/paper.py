@@ -4,8 +4,6 @@ Its 13 scenes without missing measurements are SimGeo, ICL-NUIM and Middlebury's
 have missing measurements. Scenes of other data sets are grouped by whether their ground truth has holes.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass

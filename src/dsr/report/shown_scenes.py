@@ -1,7 +1,5 @@
 """Scenes of a benchmark setting with one result per method, as figures, pages and studies show them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ American Statistician 2015, section 4.2). The test is the permutation test of pa
 under the hypothesis: exact up to :data:`_EXACT` scenes. With five, no difference is significant.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

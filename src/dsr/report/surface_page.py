@@ -7,8 +7,6 @@ the 32-bit floats that graphics cards compute with. 16 bits would not be enough:
 steps of 5 mm at the far end, which are visible as terraces.
 """
 
-from __future__ import annotations
-
 import base64
 import math
 import zlib

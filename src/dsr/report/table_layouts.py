@@ -1,7 +1,5 @@
 """Tables in the layouts of readers and programs: Markdown, LaTeX with booktabs rules, CSV, and a terminal."""
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The calls that draw and encode the parts of a report, in this process or in several."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Callable, Generator, Sequence

@@ -1,7 +1,5 @@
 """Rendered scenes: ray casters, the SimGeo scenes, and random scenes to train on."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -5,8 +5,6 @@ of shape (3, N). A camera ray has z = 1, so that the ray parameter of its hit is
 functions from points in metres to linear RGB (3, N).
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable

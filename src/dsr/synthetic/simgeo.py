@@ -8,8 +8,6 @@ The statue is a winged, draped figure with a torch, an implicit surface. Points 
 right, y up from the floor, z towards the viewer.
 """
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """What trainings log besides validation scores, through Lightning's loggers."""
 
-from __future__ import annotations
-
 import re
 import time
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Training data: random patches of the scenes of data sets, and whole scenes for validation."""
 
-from __future__ import annotations
-
 import functools
 import math
 import os

@@ -1,7 +1,5 @@
 """The degradation that a network learns to undo, and the tensors of a sample that it trains on."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Training of super-resolution networks with Lightning."""
 
-from __future__ import annotations
-
 import copy
 import functools
 import json

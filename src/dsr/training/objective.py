@@ -6,8 +6,6 @@ degree (Ramamoorthi and Hanrahan, SIGGRAPH 2001) of the normals n. The l_b are f
 of the reference depth, the albedo from the photo alone, by Retinex (Grosse et al., ICCV 2009).
 """
 
-from __future__ import annotations
-
 import abc
 import math
 from collections.abc import Callable, Sequence

@@ -4,8 +4,6 @@ Patch number i of a run is a pure function of (seed, i), and of the number of pa
 So an interrupted run continues with the same patches, whatever the number of workers and devices.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import math

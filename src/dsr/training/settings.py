@@ -1,7 +1,5 @@
 """The settings of a training's patches, without torch: a configuration is checked before torch is imported."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Arrays in ``.npz`` files, and tensors in torch's own: plain values alone, never Python objects."""
 
-from __future__ import annotations
-
 import warnings
 import zipfile
 from collections.abc import Container, Mapping

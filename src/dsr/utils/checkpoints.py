@@ -4,8 +4,6 @@ A single batch can have a gradient that is not finite, such as one of a degenera
 step out is not lost, so a few of them in a row are tolerated. Weights that are not finite never become finite again.
 """
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import logging

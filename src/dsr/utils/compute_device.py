@@ -1,7 +1,5 @@
 """Devices to compute on."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import os

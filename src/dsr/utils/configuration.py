@@ -7,8 +7,6 @@ name the key, and quickness: an error of the target that begins with an argument
 shown with the key that sets it (``method.sharpness: expected ...``).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import importlib

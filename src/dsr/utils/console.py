@@ -1,7 +1,5 @@
 """Exit codes, the console and the progress display of all commands."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import functools

@@ -4,8 +4,6 @@ Pillow reads the headers; those of TIFF (revision 6.0 of the specification, and 
 behind the first one, and for tags that OpenCV ignores.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

@@ -4,8 +4,6 @@ A target is a plain file, or none yet: a device, a pipe, a socket or a link is n
 have the permissions that the umask leaves.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

@@ -4,8 +4,6 @@ A few kilobytes of compressed zeros unpack to gigabytes: :func:`limit_memory` en
 picture's header states are checked before it is decoded: a depth map may have 4 times the pixels of its photo.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

@@ -5,8 +5,6 @@ the process. Within :func:`deferred` the first one is only noted: a training com
 are replaced atomically, so that an interruption leaves nothing half-written.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import multiprocessing

@@ -4,8 +4,6 @@ The type says how an option is read: ``bool`` is a flag, ``Literal`` a choice, `
 ``tuple[T, T]`` two values, and ``X | None`` may be left out. A field whose type is such a dataclass again is a group.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 from argparse import SUPPRESS, ArgumentTypeError, Namespace

@@ -4,8 +4,6 @@ Locks lie in ``.locks``; the system releases them when their process ends, howev
 that call functions of items; if one is killed, new ones take over, once.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import hashlib

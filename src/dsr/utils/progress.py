@@ -1,7 +1,5 @@
 """Progress of long-running work, and times, sizes and lengths as text."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterable, Iterator
 from typing import Literal, Protocol, TypeVar

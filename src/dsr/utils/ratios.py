@@ -1,7 +1,5 @@
 """Ratios of two resolutions: the upsampling factors, and others, such as the 2.667 of some sensors' maps."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 
 SCALES = (2, 4, 8, 16)

@@ -3,8 +3,6 @@
 TensorBoard takes the columns from the first run that it finds, so all have to have the same ones, of the same types.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Literal
 

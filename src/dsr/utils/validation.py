@@ -1,7 +1,5 @@
 """Numbers of files for pydantic, and its errors as one line: the key, the expected and the actual value."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from typing import Annotated, TypeVar

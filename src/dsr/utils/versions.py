@@ -1,7 +1,5 @@
 """Identification of results: versions of the software, and hashes of files and of code outside of the package."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import importlib.util

@@ -1,7 +1,5 @@
 """``dsr.upsample`` and ``dsr.Upsampler``: what the command computes, from Python."""
 
-from __future__ import annotations
-
 import functools
 import threading
 import time

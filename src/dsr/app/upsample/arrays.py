@@ -1,7 +1,5 @@
 """Photos and depth maps of notebooks and programs: arrays, tensors and pictures in memory, one or a batch."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import Any

@@ -4,8 +4,6 @@ Photo and depth map are compared by their edges (:func:`align`); with ``--regist
 photo's. Warnings about a sample of the frames apply to all similar frames (:func:`check_together`).
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace

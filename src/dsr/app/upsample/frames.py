@@ -1,7 +1,5 @@
 """The frames of ``dsr upsample``: found in files and folders, with poses, their checks, and fusion with neighbours."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

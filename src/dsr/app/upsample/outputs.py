@@ -1,7 +1,5 @@
 """The folder of one result: its parts are written, and what it depends on is compared with an earlier run's."""
 
-from __future__ import annotations
-
 import functools
 import json
 import math

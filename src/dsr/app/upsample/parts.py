@@ -1,7 +1,5 @@
 """The table of all parts of the results of ``dsr upsample``, and the options that choose among them."""
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 from dataclasses import dataclass

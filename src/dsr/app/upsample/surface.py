@@ -1,7 +1,5 @@
 """``dsr.Surface``: an upsampled depth map with its normals, renderings, points, mesh and expected errors."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import os

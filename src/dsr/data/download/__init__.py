@@ -1,7 +1,5 @@
 """Getting data sets: those that ``dsr data`` knows, which ``collections.yaml`` describes, and how they are fetched."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

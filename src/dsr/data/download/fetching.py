@@ -5,8 +5,6 @@ recorded then. Files are on disk under their names whole or not at all. Download
 requests, RFC 9110, section 14): what there is of a file, ``.part``, has the date of the version that it belongs to.
 """
 
-from __future__ import annotations
-
 import contextlib
 import email.utils
 import errno

@@ -1,7 +1,5 @@
 """Archives, folders with the same members, parts of files, and compressed data; sizes are checked before unpacking."""
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import functools

@@ -11,8 +11,6 @@ looking along -z) to the world, y up; the corrected photos and cameras are taken
 App's samples, https://github.com/laanlabs/3dScannerApp_samples, have intrinsics and ARKit's pose row by row.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from dataclasses import replace

@@ -4,8 +4,6 @@ https://github.com/ros-perception/image_transport_plugins: ``compressed_depth_im
 ``compressedDepth`` (compression_common.h), the quantisation of floats (codec.cpp) and RVL (rvl_codec.cpp).
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import struct

@@ -16,8 +16,6 @@ https://docs.nerf.studio/quickstart/data_conventions.html: intrinsics and lens c
 the first pixel's corner at (0, 0), and poses of OpenGL's camera.
 """
 
-from __future__ import annotations
-
 import functools
 import io
 import math

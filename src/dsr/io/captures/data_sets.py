@@ -14,8 +14,6 @@ not at all, which is 0; RX, CV and RZ, a rotation vector. OpenCV's ``stereoRecti
 the SDK, which may calibrate anew when it opens a camera, has another one within about a percent.
 """
 
-from __future__ import annotations
-
 import configparser
 import contextlib
 import functools

@@ -8,8 +8,6 @@ pixels of the reference size, of the picture before it is turned as its properti
 up to an unknown scale and shift.
 """
 
-from __future__ import annotations
-
 import functools
 import re
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ part of that image, scaled. The lens model is OpenCV's. That of Orbbec's wrapper
 OpenCV's mixed tangential terms and is taken for it: tenths of a pixel in the corners of a 4K photo.
 """
 
-from __future__ import annotations
-
 import functools
 import threading
 from collections.abc import Iterator, Sequence

@@ -14,8 +14,6 @@ https://github.com/IntelRealSense/librealsense, src/media/ros/ros_file_format.h 
 inverse of that of depth.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

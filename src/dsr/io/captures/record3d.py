@@ -12,8 +12,6 @@ The export has the same as ``metadata.json``, ``rgb/12.jpg`` (or .png) and ``dep
 to the world; the camera has OpenGL's axes. Recordings of the front camera have no poses: all are the same.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import re

@@ -16,8 +16,6 @@ ScanNet++; https://github.com/scannetpp/scannetpp, iphone/prepare_iphone_data.py
 deflate of float32 in metres.
 """
 
-from __future__ import annotations
-
 import contextlib
 import struct
 import zlib

@@ -11,8 +11,6 @@ with Gaussians f of the distance in low-resolution pixels and g of the colour di
 weights. What differs: I_q is the mean colour over the low-resolution pixel, and the largest weight of a pixel is 1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 

@@ -14,8 +14,6 @@ multiplied by ``mixed``. Pixels on edges get the value that preserves the mean o
 then takes the reachable pixels of its most similar neighbour off the edge.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

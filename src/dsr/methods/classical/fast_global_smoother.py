@@ -10,8 +10,6 @@ their index map are both smoothed and divided, as in the paper. What differs: la
 pixels, and far smaller than the paper's, which blurs renderings.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -14,8 +14,6 @@ low-resolution map) and the identity U. The result is the mean over the windows 
 windows are weighted by their confidence, so that holes do not spread.
 """
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from dataclasses import dataclass, field
 

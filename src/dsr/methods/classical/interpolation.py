@@ -5,8 +5,6 @@ Processing*, IEEE TASSP 1981, with a = -0.5, as Pillow enlarges floating-point i
 pixels a side and does not overshoot beyond them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 

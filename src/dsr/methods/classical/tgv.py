@@ -16,8 +16,6 @@ them to 0, which bends planes. It starts from the bicubic map and its gradient, 
 the low resolution. alpha_0 is 2.4 instead of 17.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal, NamedTuple

@@ -13,8 +13,6 @@ The network is the hourglass of Ulyanov et al. What differs: convolutions are pa
 computes in float32, and the widths may differ between levels.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

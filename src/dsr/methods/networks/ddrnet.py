@@ -9,8 +9,6 @@ What differs: the input is the bicubic upsampling of a low-resolution map, exact
 -1..1; the refinement network learns a residual, too; the sizes are halved once at x2 and twice otherwise.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional

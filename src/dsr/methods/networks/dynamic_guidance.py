@@ -11,8 +11,6 @@ What differs, besides what docs/measurements/methods.md says: the k_l have unit 
 (Roth and Black, IJCV 2009), the data step iterative back-projection (Irani and Peleg 1991), the form of w_l is ours.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from typing import Any

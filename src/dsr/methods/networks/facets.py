@@ -9,8 +9,6 @@ does not overshoot the extended planes.
 Below it are the layers that it shares with :mod:`dsr.methods.networks.facets_unet`, which can start from its weights.
 """
 
-from __future__ import annotations
-
 import itertools
 from typing import Any, cast
 

@@ -4,8 +4,6 @@ There are weights for maps whose size is the photo's over 1 and 2, over 4, over 
 photo is resized to a multiple of the map, and the result to the photo's size.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType

@@ -4,8 +4,6 @@ A plane is its value at the centre of a low-resolution pixel and its two slopes 
 axis but two: (B, facets, 3, h, w). Everything here reproduces planes exactly.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

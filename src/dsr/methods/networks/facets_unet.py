@@ -8,8 +8,6 @@ et al., *CondConv*, NeurIPS 2019). Where the kernel is known, the residual is ad
 1991). Maps of the photo's own size have the weights of factor 2. Disparity is divided by its median.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping, Sequence

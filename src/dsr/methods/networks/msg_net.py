@@ -10,8 +10,6 @@ missing, and its PReLUs have a slope for each channel. ``voynov`` subtracts its 
 ``dsr`` has no drift, its guidance is the luma alone, and holes are inpainted instead of set to the minimum.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, Literal, get_args
 

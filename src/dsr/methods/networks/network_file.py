@@ -8,8 +8,6 @@ holes, normalisation, one pass of the network, and the way back to the unit of t
 makes the graph. The other one (``dynamo=True``) needs minutes for Facets, and rules out sizes.
 """
 
-from __future__ import annotations
-
 import importlib
 import math
 import os

@@ -11,8 +11,6 @@ w |x| - huber / 2 w^2. What differs is in docs/measurements/methods.md; the unit
 :mod:`dsr.methods.networks.facets_planes`.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from types import SimpleNamespace

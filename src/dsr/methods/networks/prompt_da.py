@@ -8,8 +8,6 @@ patches and normalised as for ImageNet, the result by a bicubic kernel with a = 
 itself brings the prompt's minimum and maximum to 0 and 1. It was trained on the 256 x 192 pixels of ARKit's lidar.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import re

@@ -9,8 +9,6 @@ pixels of the true depth. It works on disparity, normalised by the low-resolutio
 The trunk has half the channels by default, and starts from random weights.
 """
 
-from __future__ import annotations
-
 import itertools
 
 import torch

@@ -4,8 +4,6 @@
 reader of the protobuf wire format (protobuf.dev/programming-guides/encoding). Neither executes code from a file.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

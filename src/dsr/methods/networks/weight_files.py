@@ -6,8 +6,6 @@ their names. ``file``: the name of the published file in a directory; ``files``:
 ``source``: where the published files are from, for messages.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection, Mapping
 from pathlib import Path

@@ -4,8 +4,6 @@
 ``exclude-package-data`` in pyproject.toml; ``dsr data get weights`` fetches them.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 from collections.abc import Mapping

@@ -3,8 +3,6 @@
 Here are its options, which are checked before drawing code is imported.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from dsr.geometry.lights import LIGHT_CHOICES, LIGHT_NAMES, STUDY_LIGHT

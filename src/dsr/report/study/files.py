@@ -1,7 +1,5 @@
 """The files of a study: its key, which participants do not get, and their answers; each participant counts once."""
 
-from __future__ import annotations
-
 import json
 import os
 from codecs import BOM_UTF8

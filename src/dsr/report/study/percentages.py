@@ -4,8 +4,6 @@ User 1st is the fraction of participants who chose a method's rendering as most 
 User 2nd as second most similar, Top 2 as either (Voynov et al., "Perceptual Deep Depth Super-Resolution", ICCV 2019).
 """
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Iterator, Sequence

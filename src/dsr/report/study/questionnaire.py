@@ -1,7 +1,5 @@
 """The page of a study, one self-contained HTML file, from runs, and the key that maps its pictures to methods."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import io

@@ -4,8 +4,6 @@ Furniture is made by functions from a generator to shapes on z = 0 (or hanging o
 one for each material. Fronts look along -y.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -5,8 +5,6 @@ to linear RGB (3, N). ``scale`` is the size of the painted object in metres. Mos
 shape's edges, so that a network learns not to take edges of texture for edges of depth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

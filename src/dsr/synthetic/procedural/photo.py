@@ -5,8 +5,6 @@ normals suggest (half of the displacement of Phong tessellation, Boubekeur and A
 paraboloid). Flat triangles stay flat, spheres have no facets, and the depth is continuous across edges.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

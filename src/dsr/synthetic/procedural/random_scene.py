@@ -5,8 +5,6 @@ Shapes, paints, cameras and lamps are made in metres; rendered depth is then sca
 ``RandomScene.metres``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

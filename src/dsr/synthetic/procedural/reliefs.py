@@ -5,8 +5,6 @@ each. It returns heights in about [0, 1] and a tone for paint, (R, R) each, and 
 side.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

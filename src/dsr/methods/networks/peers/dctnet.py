@@ -8,8 +8,6 @@ As in the authors' code, the right-hand side has a Laplacian of 3 x 3 weights di
 the left-hand side the eigenvalues of the Laplacian of four neighbours. Layers have the names of the authors' files.
 """
 
-from __future__ import annotations
-
 import itertools
 from types import MappingProxyType
 

@@ -7,8 +7,6 @@ the photo's features, which are then added to the depth's. The branch that learn
 needed for training only and left out. Layers have the names of the authors' files.
 """
 
-from __future__ import annotations
-
 from types import MappingProxyType
 
 import torch

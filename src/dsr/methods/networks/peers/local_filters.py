@@ -9,8 +9,6 @@ FDKN, the fast deformable kernel network: Kim, Ponce, Ham, *Deformable Kernel Ne
 it and their weights, from the enlarged map and the photo, and adds the weighted sum of the map there.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 from types import MappingProxyType
 

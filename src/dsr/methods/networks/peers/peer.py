@@ -5,8 +5,6 @@ and the maximum of the *true* map, which no method can know. :class:`Peer` takes
 the true ones only on request, to reproduce the authors' figures.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Mapping

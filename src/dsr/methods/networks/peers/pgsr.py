@@ -7,8 +7,6 @@ Attention between the planes of both then weighs the photo's features. Everythin
 the photo's resolution. Layers have the names of the authors' files. Weights: github.com/XrKang/PGSR.
 """
 
-from __future__ import annotations
-
 import re
 from types import MappingProxyType
 
