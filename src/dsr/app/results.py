@@ -66,7 +66,8 @@ def view(request: ViewRequest, console: Console) -> list[str]:
     largest, factors = max(each.vertices for each in packed), sorted({each.about["after"]["factor"] for each in packed})
     reduced = "" if factors == [1] else f", maps reduced by {' or '.join(map(str, factors))} each way"
     size = megabytes(page.stat().st_size)
-    show(console, f"{_count(packed)}, at most {largest:,} vertices each{reduced}, {size} -> {page}")
+    count = "1 result" if len(packed) == 1 else f"{len(packed)} results"
+    show(console, f"{count}, at most {largest:,} vertices each{reduced}, {size} -> {page}")
     if request.open_page and not webbrowser.open(page.resolve().as_uri()):
         show(console, "there is no browser to open it with; open it yourself, or copy it to where there is one")
     return problems
@@ -125,14 +126,11 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
     comment = world_comment(ups.pop() if len(ups) == 1 else "")
     write_ply(request.output, mesh.vertices, colours, mesh.normals, mesh.faces, frame=comment)
     size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, voxels of {show_length(voxel)}"
-    show(console, f"{_count(frames)} -> {request.output}: {size}; in the world's frame of the poses")
+    count = "1 result" if len(frames) == 1 else f"{len(frames)} results"
+    show(console, f"{count} -> {request.output}: {size}; in the world's frame of the poses")
     if request.score:
         show(console, f"successive results differ by {_difference(frames, max_error)} (OPW)")
     return problems
-
-
-def _count(results: Sequence[object]) -> str:
-    return "1 result" if len(results) == 1 else f"{len(results)} results"
 
 
 def _difference(frames: Sequence[Path], max_error: float) -> str:
@@ -170,8 +168,12 @@ def _colours(
     """Return the mean colour of points at most ``near`` metres from frames' depth, (N, 3) uint8; grey without photo."""
     total, weight = np.zeros(vertices.shape), np.zeros(len(vertices))
     for folder in frames:
+        path, photo = folder / "rgbd" / RGBD[0], None
         try:
-            photo = _photo(folder)
+            if (folder / INPUT).is_file():
+                photo = read_input(folder / INPUT)[0]
+            elif path.is_file():
+                photo = read_pixels(path, cv2.IMREAD_COLOR)[..., ::-1]
         except (ValueError, OSError) as error:
             problems.append(one_line(error))
             continue
@@ -192,11 +194,3 @@ def _colours(
     known = weight > 0
     total[known] /= weight[known, None]
     return np.where(known[:, None], np.rint(total), _GREY).astype(np.uint8)
-
-
-def _photo(folder: Path) -> np.ndarray | None:
-    """Return the photo of a result, (H, W, 3) uint8, perhaps smaller than its depth; None if there is none."""
-    if (folder / INPUT).is_file():
-        return read_input(folder / INPUT)[0]
-    path = folder / "rgbd" / RGBD[0]
-    return read_pixels(path, cv2.IMREAD_COLOR)[..., ::-1] if path.is_file() else None

@@ -3,7 +3,6 @@
 A shell's script asks ``dsr completion --line LINE`` for the words that may stand at the end of the line.
 """
 
-import argparse
 import contextlib
 import shlex
 from collections.abc import Callable, Iterable
@@ -62,29 +61,21 @@ def words_at_end(parser: Parser, line: str) -> list[str]:
     for word in before:
         parser = parser.commands.get(word, parser)
     if "-" not in parser.prefix_chars:  # Hydra's
-        return _overrides(last)
+        directories = config_directories()
+        key, equals, _ = last.partition("=")
+        if equals:  # a choice of a group
+            return [f"{key}={choice}" for choice in list_choices(key.lstrip("+"), directories)]
+        groups = sorted(path.name for path in directories[0].iterdir() if path.is_dir())
+        return [f"+{each}=" if each == "experiment" else f"{each}=" for each in groups] + [*_HYDRA_FLAGS]
     options = parser._option_string_actions
     action = options.get(before[-1] if before else "")
     if action is not None and action.nargs != 0:
-        return _names_of(action)
-    if last.startswith("-"):
-        return [*options]
-    arguments = [each for each in parser._actions if not each.option_strings]
-    return [*parser.commands] or [name for each in arguments for name in _names_of(each)]
-
-
-def _names_of(action: argparse.Action) -> list[str]:
-    return [str(name) for name in action.choices or _NAMES.get(action.dest, tuple)()]
-
-
-def _overrides(last: str) -> list[str]:
-    """Return what an argument of Hydra's may become: a group, or a choice of the group that it begins with."""
-    directories = config_directories()
-    key, equals, _ = last.partition("=")
-    if equals:
-        return [f"{key}={choice}" for choice in list_choices(key.lstrip("+"), directories)]
-    groups = sorted(path.name for path in directories[0].iterdir() if path.is_dir())
-    return [f"+{each}=" if each == "experiment" else f"{each}=" for each in groups] + [*_HYDRA_FLAGS]
+        expected = [action]
+    elif last.startswith("-") or parser.commands:
+        return [*options] if last.startswith("-") else [*parser.commands]
+    else:
+        expected = [each for each in parser._actions if not each.option_strings]
+    return [str(name) for each in expected for name in each.choices or _NAMES.get(each.dest, tuple)()]
 
 
 def _split(line: str) -> list[str]:

@@ -1,5 +1,6 @@
 """The tasks of ``dsr data``; separate from its options, which are parsed without importing them."""
 
+import contextlib
 import sys
 import textwrap
 from collections.abc import Mapping
@@ -27,13 +28,13 @@ _URL = "Weights"  # the label of the release's files in ``project.urls`` of pypr
 
 
 def downloads() -> Mapping[str, Collection]:
-    """Return the data sets, and the weights that this installation does not come with, by their names."""
-    absent = weights.left_out()
-    return {**CATALOGUE, weights.FOLDER: _weights(absent)} if absent else CATALOGUE
+    """Return the data sets, and the weights that this installation does not come with, by their names.
 
-
-def _weights(names: list[str]) -> Collection:
-    """Return weights to fetch from the release, or from a mirror."""
+    The weights are fetched from the release, or from a mirror.
+    """
+    names = weights.left_out()
+    if not names:
+        return CATALOGUE
     try:
         stated = metadata(DISTRIBUTION).get_all("Project-URL") or []
     except PackageNotFoundError:
@@ -47,7 +48,7 @@ def _weights(names: list[str]) -> Collection:
         )
         for name in names
     )
-    return Collection(
+    collection = Collection(
         weights.FOLDER,
         "weights of networks for comparison, which a wheel leaves out",
         address or "a checkout has them in src/dsr/methods/weights",
@@ -57,6 +58,7 @@ def _weights(names: list[str]) -> Collection:
         None,
         tuple(items),
     )
+    return {**CATALOGUE, weights.FOLDER: collection}
 
 
 def list_data_sets(_: DataListRequest, console: Console) -> list[str]:
@@ -96,8 +98,12 @@ def get_data_sets(request: DataGetRequest, console: Console) -> list[str]:
         _describe(collection, console)
     if items:
         show(console, f"{missing} of {len(items)} files are missing in {root.absolute()}")
-    if missing and not request.yes and sys.stdin.isatty() and console.is_terminal and not _agreed(console):
-        return []
+    if missing and not request.yes and sys.stdin.isatty() and console.is_terminal:
+        agreed = False
+        with contextlib.suppress(EOFError):  # Ctrl-D
+            agreed = Confirm.ask("fetch them?", console=console, default=True)
+        if not agreed:
+            return []
     problems = []
     if items:
         problems = get(items.values(), root, progress, mirror=request.mirror, keep_archives=request.keep_archives)
@@ -107,14 +113,6 @@ def get_data_sets(request: DataGetRequest, console: Console) -> list[str]:
     if not problems:
         show(console, f"{', '.join(collection.name for collection in collections)}: complete")
     return problems
-
-
-def _agreed(console: Console) -> bool:
-    """Ask for confirmation, and return whether the user agrees; Ctrl-D does not."""
-    try:
-        return Confirm.ask("fetch them?", console=console, default=True)
-    except EOFError:
-        return False
 
 
 def _describe(collection: Collection, console: Console) -> None:

@@ -117,25 +117,23 @@ def check_device() -> list[Finding]:
 def check_folders() -> list[Finding]:
     """Check the working directory, the cache and the data sets: whether they are writable, and the free space."""
     named = {"results": Path(), "cache": cache_directory(), "temporary": Path(tempfile.gettempdir())}
-    found = [_folder(name, path.absolute()) for name, path in named.items()]
+    found = []
+    for name, folder in named.items():
+        path = folder.absolute()
+        nearest = next(each for each in (path, *path.parents) if each.exists())
+        if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
+            level: Level = "warning" if name == "results" else "problem"
+            advice = {"cache": "set DSR_CACHE to a folder of yours", "temporary": "set TMPDIR to a folder of yours"}
+            elsewhere = advice.get(name, "write results elsewhere: -o DIR")
+            found.append(Finding(name, level, f"{path}: cannot be written", elsewhere))
+            continue
+        free = shutil.disk_usage(nearest).free
+        little = "free some space; results of a large photo take 1 GB" if free < _LITTLE else ""
+        found.append(Finding(name, "warning" if little else "ok", f"{path}, {megabytes(free)} free", little))
     root = data_root().absolute()
     there = [each.name for each in CATALOGUE.values() if any((root / folder).is_dir() for folder in each.folders)]
     of = f"{len(there)} of {len(CATALOGUE)} data sets" + (f": {', '.join(there)}" if there else "")
     return [*found, Finding("data", "ok", f"{root}, {of}; `dsr data list` has all")]
-
-
-def _folder(name: str, path: Path) -> Finding:
-    """Return whether one can write to a folder, or make it, and how much is free."""
-    there = next(each for each in (path, *path.parents) if each.exists())
-    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
-        level: Level = "warning" if name == "results" else "problem"
-        advice = {"cache": "set DSR_CACHE to a folder of yours", "temporary": "set TMPDIR to a folder of yours"}
-        return Finding(name, level, f"{path}: cannot be written", advice.get(name, "write results elsewhere: -o DIR"))
-    free = shutil.disk_usage(there).free
-    message = f"{path}, {megabytes(free)} free"
-    if free < _LITTLE:
-        return Finding(name, "warning", message, "free some space; results of a large photo take 1 GB")
-    return Finding(name, "ok", message)
 
 
 def check_extras() -> list[Finding]:

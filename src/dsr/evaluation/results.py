@@ -32,7 +32,7 @@ METHOD_ORDER = (
     "SRfS", "EG", "PDN", "DG", "DIP", "MSG", "DIP-V", "MSG-V",
 )  # fmt: skip
 """Order of the methods: simple ones, then those of the paper in the order of its tables; others follow."""
-_DATASET_ORDER = ("simgeo", "icl", "middlebury", "sunrgbd", "tofmark")
+DATASET_ORDER = ("simgeo", "icl", "middlebury", "sunrgbd", "tofmark")
 _ERRORS = ("depth_error", "angle_error")
 _DAMAGED = "{}: expected a prediction, got a missing or damaged file"
 
@@ -208,7 +208,7 @@ class Results:
 
     def methods(self) -> list[str]:
         """Return the labels of the methods, in order."""
-        return sorted({run.label for run in self.runs}, key=method_key)
+        return sorted({run.label for run in self.runs}, key=paper_key)
 
     def problems(self) -> list[BenchmarkSetting]:
         """Return the evaluated settings, in order."""
@@ -255,15 +255,7 @@ def method_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in known.items() if key != "_target_" and not key.startswith("weights_")}
 
 
-def problem_key(problem: BenchmarkSetting) -> tuple[Any, ...]:
-    """Order data sets as the paper does, others after them."""
-    return (*_rank(problem.dataset.partition(" (")[0], _DATASET_ORDER), problem)
-
-
-def method_key(label: str) -> tuple[Any, ...]:
-    """Order methods as the paper's tables do, others after them."""
-    return (*_rank(label.partition(" (")[0], METHOD_ORDER), label)
-
-
-def _rank(name: str, order: Sequence[str]) -> tuple[int, str]:
-    return (order.index(name), "") if name in order else (len(order), name)
+def paper_key(label: str, order: Sequence[str] = METHOD_ORDER) -> tuple[int, str, str]:
+    """Return a key that orders methods, or data sets, as the paper's tables do, and others after them."""
+    name, _, _ = label.partition(" (")
+    return (order.index(name), "", label) if name in order else (len(order), name, label)

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import pandas as pd
 from pydantic import BaseModel, Field
 
-from dsr.evaluation.results import Results, Run, method_key, method_settings, prediction_path, problem_key, sample_path
+from dsr.evaluation.results import DATASET_ORDER, Results, Run, method_settings, paper_key, prediction_path, sample_path
 from dsr.metrics.formats import MetricFormat
 from dsr.utils.arrays import array_headers
 from dsr.utils.guards import MOST_TABLE, OutsideError, natural_key, read_limited, refusing
@@ -60,7 +60,7 @@ def load_results(paths: Sequence[Path]) -> Results:
     if not runs:
         reason = f"; {unsolved[0]}" if unsolved else ""
         raise ValueError(f"{', '.join(map(str, paths))}: expected runs with a prediction, found none{reason}")
-    runs.sort(key=lambda run: (problem_key(run.problem), method_key(run.label), run.seed))
+    runs.sort(key=lambda run: (paper_key(run.dataset, DATASET_ORDER), run.problem, paper_key(run.label), run.seed))
     return Results(tuple(runs), (*notes, *older, *unsolved))
 
 

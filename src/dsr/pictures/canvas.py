@@ -63,11 +63,6 @@ class Canvas:
         self._pictures.set(xlim=(0, width), ylim=(0, height))
         self._pictures.set_axis_off()
 
-    @property
-    def images(self) -> list[AxesImage]:
-        """The pictures, in the order in which they were drawn."""
-        return list(self._pictures.images)
-
     def text(self, x: float, y: float, text: str, **style: Any) -> None:
         """Write a text, none of which is taken as a formula."""
         width, height = self.figure.get_size_inches()
@@ -176,20 +171,16 @@ def write_figure(
     """Write a figure atomically, in the format given by the suffix; a PNG of few colours has a table of 256 of them."""
     with replacing(path) as temporary, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a name may have letters that the font lacks
-        if path.suffix == ".png":
-            _write_png(temporary, figure, dpi, few_colours)
-        else:
+        if path.suffix != ".png":
             figure.savefig(temporary, dpi=dpi, metadata=metadata)
-
-
-def _write_png(path: Path, figure: Figure, dpi: int, few_colours: bool) -> None:
-    canvas = FigureCanvasAgg(figure)
-    figure.set_dpi(dpi)
-    canvas.draw()
-    opaque = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")  # 3 channels are written faster
-    if few_colours:
-        opaque = opaque.quantize(256)
-    opaque.save(path, "PNG", compress_level=_PNG_LEVEL, dpi=(dpi, dpi))
+            return
+        canvas = FigureCanvasAgg(figure)
+        figure.set_dpi(dpi)
+        canvas.draw()
+        opaque = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")  # 3 channels are written faster
+        if few_colours:
+            opaque = opaque.quantize(256)
+        opaque.save(temporary, "PNG", compress_level=_PNG_LEVEL, dpi=(dpi, dpi))
 
 
 def encode_row(panels: Sequence[np.ndarray]) -> bytes:
@@ -200,7 +191,14 @@ def encode_row(panels: Sequence[np.ndarray]) -> bytes:
     height, width = panels[0].shape[:2]
     scale = min(_HEIGHT / height, _WIDTH / width)
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    shown = [_resized(panel, size) for panel in panels]
+    opaque = np.full((size[1], size[0], 1), 255, np.uint8)
+    shown = []  # the panels as RGBA of this size
+    for panel in panels:
+        colour = np.repeat(panel[..., None], 3, axis=2) if panel.ndim == 2 else panel
+        pixels: Any = with_holes(colour).astype(np.float32)
+        smaller = size[0] < pixels.shape[1]
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_NEAREST)
+        shown.append(np.concatenate((np.round(255 * pixels.clip(0, 1)).astype(np.uint8), opaque), axis=2))
     gap = np.zeros((size[1], _GAP, 4), np.uint8)
     row = np.concatenate([each for panel in shown for each in (gap, panel)][1:], axis=1)
     done, content = cv2.imencode(".webp", row[..., [2, 1, 0, 3]], [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
@@ -213,12 +211,3 @@ def with_holes(picture: np.ndarray) -> np.ndarray:
     """Return an (H, W, 3) picture with the pixels that are not finite in the hole colour."""
     known = np.isfinite(picture).all(axis=2, keepdims=True)
     return np.where(known, picture, np.array(colours("gray").get_bad()[:3], picture.dtype))
-
-
-def _resized(panel: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Return a panel as RGBA of a width and height."""
-    pixels: Any = with_holes(np.repeat(panel[..., None], 3, axis=2) if panel.ndim == 2 else panel).astype(np.float32)
-    smaller = size[0] < pixels.shape[1]
-    pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_NEAREST)
-    known = np.full((size[1], size[0], 1), 255, np.uint8)
-    return np.concatenate((np.round(255 * pixels.clip(0, 1)).astype(np.uint8), known), axis=2)

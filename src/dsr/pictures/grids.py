@@ -55,7 +55,12 @@ def draw_grid(columns: Sequence[str], rows: Sequence[Row], texts: tuple[str, str
     """Draw a page of rows, each with one cell per column heading, between a text above and one below."""
     right = _MARGIN + (_BAR + _BAR_TEXT if any(row.bar for row in rows) else 0)
     panel = min(max((_WIDTH - 0.3 - right) / len(columns) - _GAP, _LEAST_PANEL), _MOST_PANEL)
-    boxes = [_boxes(row, panel) for row in rows]
+    boxes = []  # of each row: width and height of a picture, and heights of details and caption, inches
+    for row in rows:
+        width = panel * min(1.0, _TALLEST / row.aspect)
+        details = (panel - _SEAM * (len(row.details) - 1)) / len(row.details) + _SEAM if row.details else 0.0
+        caption = _LINE if any(cell.caption and cell.picture is not None for cell in row.cells) else 0.0
+        boxes.append((width, max(width * row.aspect, 0.15), details, caption))
     labels = [_wrap(row.label, sum(heights)) for row, (_, *heights) in zip(rows, boxes, strict=True)]
     left = _MARGIN + _LINE * max(label.count("\n") + 1 for label in labels) + 0.03
     heads = [_wrap(column, panel) for column in columns]
@@ -77,14 +82,6 @@ def draw_grid(columns: Sequence[str], rows: Sequence[Row], texts: tuple[str, str
             page.bar_of(row, left + len(columns) * (panel + _GAP), level, box[1])
         level -= sum(box[1:]) + _GAP
     return page.figure
-
-
-def _boxes(row: Row, panel: float) -> tuple[float, float, float, float]:
-    """Return the sizes of a row in inches: width and height of a picture, and heights of details and caption."""
-    width = panel * min(1.0, _TALLEST / row.aspect)
-    details = (panel - _SEAM * (len(row.details) - 1)) / len(row.details) + _SEAM if row.details else 0.0
-    caption = _LINE if any(cell.caption and cell.picture is not None for cell in row.cells) else 0.0
-    return width, max(width * row.aspect, 0.15), details, caption
 
 
 def _wrap(text: str, length: float) -> str:
@@ -129,7 +126,7 @@ class _Page(Canvas):
 
     def bar_of(self, row: Row, left: float, top: float, height: float) -> None:
         """Draw a row's colour bar, beside its panels."""
-        panels = [image for image in self.images if image.get_label() == f"{row.label}: panel"]
+        panels = [image for image in self._pictures.images if image.get_label() == f"{row.label}: panel"]
         mapped = [image for image in panels if np.asarray(image.get_array()).ndim == 2]
         if not mapped:
             return

@@ -69,7 +69,7 @@ def _draw_sphere(axes: Axes, shades: np.ndarray, direction: Direction) -> None:
         style = {"arrowstyle": "-|>", "color": _ARROW, "linewidth": 1.8, "shrinkA": 0, "shrinkB": 0}
         axes.annotate("", (0.55 * x, 0.55 * y), (1.58 * x, 1.58 * y), arrowprops=style)
     else:
-        _draw_away(axes, 0, 0, 0.13, _ARROW)
+        _draw_away(axes, 0.13, _ARROW)
 
 
 def _draw_frame(axes: Axes) -> None:
@@ -79,15 +79,13 @@ def _draw_frame(axes: Axes) -> None:
     for name, end in (("x", (0.8, 0.0)), ("y", (0.0, 0.8))):
         axes.annotate("", end, (0, 0), arrowprops=style)
         axes.text(1.22 * end[0], 1.22 * end[1], name, ha="center", va="center", fontsize=_FONT, style="italic")
-    _draw_away(axes, 0, 0, 0.1, "0.15")
+    _draw_away(axes, 0.1, "0.15")
     axes.text(-0.24, -0.24, "z", ha="center", va="center", fontsize=_FONT, style="italic")
 
 
-def _draw_away(axes: Axes, x: float, y: float, radius: float, colour: str) -> None:
+def _draw_away(axes: Axes, radius: float, colour: str) -> None:
     """Draw the symbol of a vector that points away from the viewer: a crossed circle."""
-    axes.add_patch(Circle((x, y), radius, facecolor="white", edgecolor=colour, linewidth=1.2, zorder=3))
+    axes.add_patch(Circle((0, 0), radius, facecolor="white", edgecolor=colour, linewidth=1.2, zorder=3))
     offset = radius / 2**0.5
     for sign in (1, -1):
-        axes.plot(
-            (x - offset, x + offset), (y - sign * offset, y + sign * offset), color=colour, linewidth=1.2, zorder=4
-        )
+        axes.plot((-offset, offset), (-sign * offset, sign * offset), color=colour, linewidth=1.2, zorder=4)

@@ -31,6 +31,8 @@ _LEAST_PANEL = 0.3
 """Minimum shorter side of a panel, inches."""
 _TEXT, _MARGIN, _GAP, _ABOVE, _BELOW = 2.6, 0.15, 0.14, 0.8, 0.5
 """Width of the text column, margin, and space between panels, above the first row and below each row, inches."""
+_LEFT = tuple(_MARGIN + _TEXT + column * (_PANEL + _GAP) for column in range(4))
+"""Left edges of the columns of panels, inches."""
 _SEAM, _LEAST_LABELLED = 0.04, 0.35
 """Space between the renderings, and minimum shorter side of a rendering with a label, inches."""
 _LABEL = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.2}
@@ -97,15 +99,17 @@ def _row(scene: Scene) -> _Row:
     ]
     large_enough = min(depth.shape[-2:]) >= 2
     shades = render(normals_seen_by(camera, depth))[0] if large_enough else torch.full((4, 2, 2), torch.nan)
+    maps = (scene.rgb, depth, (~depth.isfinite()).float(), shades)
+    photo, shown, missing, renderings = (reduced(each.double(), _LONGEST).numpy() for each in maps)
     return _Row(
         "\n".join(lines),
         (view.height, view.width),
-        _reduced(scene.rgb).permute(1, 2, 0).clamp(0, 1).numpy(),
-        _reduced(depth)[0].numpy(),
+        photo.transpose(1, 2, 0).clip(0, 1),
+        shown[0],
         limits_of(depth),
-        _reduced((~depth.isfinite()).float())[0].numpy(),
+        missing[0],
         missing_fraction,
-        _reduced(shades).numpy(),
+        renderings,
     )
 
 
@@ -124,11 +128,6 @@ def _shown_map(scene: Scene) -> tuple[Tensor, Camera, list[str]]:
     )
 
 
-def _reduced(values: Tensor) -> Tensor:
-    """Convert (C, H, W) to float64 and reduce it to at most twice the pixels of a panel."""
-    return reduced(values.double(), _LONGEST)
-
-
 def _save_page(path: Path, rows: list[_Row], title: str) -> None:
     """Draw a page and write it."""
     sides = [[_PANEL * side / max(row.shape) for side in row.shape] for row in rows]
@@ -138,17 +137,12 @@ def _save_page(path: Path, rows: list[_Row], title: str) -> None:
     page = Canvas(_MARGIN + _TEXT + 4 * (_PANEL + _GAP), total)
     page.text(_MARGIN, total - 0.12, f"{title} (pink: holes)", fontsize=14, va="top")
     for column, heading in enumerate(("photo", "depth, m", "holes", f"under {LIGHT_NAMES[0]} to {LIGHT_NAMES[-1]}")):
-        page.text(_left(column) + _PANEL / 2, total - _ABOVE + 0.08, heading, ha="center", fontsize=11)
+        page.text(_LEFT[column] + _PANEL / 2, total - _ABOVE + 0.08, heading, ha="center", fontsize=11)
     top = total - _ABOVE
     for row, size, height in zip(rows, sizes, heights, strict=True):
         _draw_row(page, row, top, size)
         top -= height
     write_figure(path, page.figure, _DPI)
-
-
-def _left(column: int) -> float:
-    """Return the left edge of a column of panels, in inches."""
-    return _MARGIN + _TEXT + column * (_PANEL + _GAP)
 
 
 def _draw_row(page: Canvas, row: _Row, top: float, size: tuple[float, float]) -> None:
@@ -160,13 +154,13 @@ def _draw_row(page: Canvas, row: _Row, top: float, size: tuple[float, float]) ->
     page.text(_MARGIN, top - 0.05 - _LINE * lines, rest, **style)
     width, height = size
     photo, depth, holes, lit = (
-        Bbox.from_bounds(_left(column) + (_PANEL - width) / 2, top - height, width, height) for column in range(4)
+        Bbox.from_bounds(_LEFT[column] + (_PANEL - width) / 2, top - height, width, height) for column in range(4)
     )
     page.show(photo, row.photo)
     low, high = row.limits
     limits = (low, max(high, 1.01 * low))  # so that the ticks of a constant depth differ
     image = page.show(depth, row.depth, colour_map="viridis", limits=limits)
-    below = Bbox.from_bounds(_left(1) + 0.1 * _PANEL, top - height - 0.14, 0.8 * _PANEL, 0.07)
+    below = Bbox.from_bounds(_LEFT[1] + 0.1 * _PANEL, top - height - 0.14, 0.8 * _PANEL, 0.07)
     bar = page.bar(image, below, most=4, orientation="horizontal")
     bar.ax.tick_params(labelsize=8, pad=1.5, length=2)
     known, hole = (np.array(to_rgb(colour)) for colour in (_VALID_COLOUR, HOLE_COLOUR))

@@ -16,10 +16,8 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.colors import ListedColormap
-from torch import Tensor
 
 from dsr.evaluation.results import BenchmarkSetting, Results
-from dsr.geometry.camera import Camera
 from dsr.geometry.lights import FIGURE_LIGHT
 from dsr.metrics.catalogue import KNOWN_FORMATS
 from dsr.pictures.canvas import save_both
@@ -115,16 +113,14 @@ def draw_page(folder: Path, results: Results, page: Page | None) -> tuple[list[P
 def rendering_row(shown: Shown, light: str) -> Row:
     """Build the row of a scene's renderings."""
     scene = shown.scene
-    drawn = {label: _drawn(depth, scene.camera, light) for label, depth in shown.depths.items()}
-    truth = _drawn(scene.depth, scene.camera, light)
+    drawn = {
+        label: None if depth is None else rendering(depth, scene.camera, light) for label, depth in shown.depths.items()
+    }
+    truth = None if scene.depth is None else rendering(scene.depth, scene.camera, light)
     results = [picture for picture in drawn.values() if picture is not None]
     details = details_of(results, truth, math.ceil(scene.scale))
     around = rendering(scene.depth_lr, scene.camera_lr, light), truth
     return _row(shown, drawn, ("DSSIM_v", "RMSE_v"), around, details=details)
-
-
-def _drawn(depth: Tensor | None, camera: Camera, light: str) -> np.ndarray | None:
-    return None if depth is None else rendering(depth, camera, light)
 
 
 def depth_row(shown: Shown, _: str) -> Row:
@@ -177,7 +173,12 @@ def _row(
     camera, style = shown.scene.camera, style or {}
     cells = [Cell(shown.scene.rgb.permute(1, 2, 0).clamp(0, 1).numpy())]
     if around is not None:
-        cells.append(Cell(_enlarge(around[0], camera), **style))
+        # Pixels are repeated up to the size of a view, so that viewers do not smooth a low-resolution picture.
+        rows, columns = (
+            ((np.arange(new) + 0.5) * old / new).astype(int)
+            for old, new in zip(around[0].shape, (camera.height, camera.width), strict=True)
+        )
+        cells.append(Cell(around[0][rows[:, None], columns], **style))
     first = {label: scores.get(metrics[0], math.nan) for label, scores in shown.scores.items()}
     valid = [value for value in first.values() if math.isfinite(value)]
     best = min(valid) if len(valid) > 1 else None
@@ -192,15 +193,6 @@ def _row(
     if around is not None:
         cells.append(Cell(None, "no truth") if around[1] is None else Cell(around[1], **style))
     return Row(shown.name.replace("_", " "), camera.height / camera.width, cells, **more)
-
-
-def _enlarge(picture: np.ndarray, camera: Camera) -> np.ndarray:
-    """Repeat pixels up to the size of a view, so that viewers do not smooth a low-resolution picture."""
-    rows, columns = (
-        ((np.arange(new) + 0.5) * old / new).astype(int)
-        for old, new in zip(picture.shape, (camera.height, camera.width), strict=True)
-    )
-    return picture[rows[:, None], columns]
 
 
 def details_of(pictures: Sequence[np.ndarray], truth: np.ndarray | None, grain: int, count: int = 2) -> list[Window]:
@@ -235,11 +227,9 @@ def _most_varied(results: Results) -> DepthSample | None:
                     continue
                 if scene.depth is not None and min(scene.depth.shape[-2:]) > 1:
                     found[name] = scene
-    preferred = [found[name] for name in _PREFERRED if name in found]
-    return next(iter(preferred), max(found.values(), key=_variety, default=None))
-
-
-def _variety(scene: DepthSample) -> float:
-    """Return the standard deviation of the brightness under the light of figures."""
-    shades = _drawn(scene.depth, scene.camera, FIGURE_LIGHT)
-    return 0.0 if shades is None else float(np.nan_to_num(np.nanstd(shades)))
+    for name in _PREFERRED:
+        if name in found:
+            return found[name]
+    shades = {name: rendering(each.depth, each.camera) for name, each in found.items() if each.depth is not None}
+    varied = max(shades, key=lambda name: float(np.nan_to_num(np.nanstd(shades[name]))), default=None)
+    return None if varied is None else found[varied]

@@ -5,7 +5,7 @@ It has scores, published values, times, settings and links; :mod:`dsr.report.pag
 
 import functools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -83,7 +83,18 @@ def save_page(
         notes.insert(0, f"pictures: lossless, 8 bits{reduced}; {size}")
     data = {
         "title": title,
-        "metrics": metrics_data(results),
+        "metrics": [
+            {
+                "id": name,
+                "name": each.heading,
+                "unit": each.unit,
+                "digits": each.digits,
+                "higher": each.higher_is_better,
+                "family": family,
+            }
+            for family, members in by_family(results.formats).items()
+            for name, each in members.items()
+        ],
         "problems": [
             {**problem_data(results, problem), "calibration": agreement}
             for problem, agreement in zip(problems, pictures.calibration, strict=True)
@@ -113,15 +124,6 @@ def save_page(
     return notes
 
 
-def metrics_data(results: Results) -> list[dict[str, Any]]:
-    """Return the metrics of all runs: heading, unit, digits, whether higher is better, and their family."""
-    return [
-        {"id": name, "name": each.heading, "unit": each.unit, "digits": each.digits, "higher": each.higher_is_better,
-         "family": family}
-        for family, members in by_family(results.formats).items() for name, each in members.items()
-    ]  # fmt: skip
-
-
 def problem_data(results: Results, problem: BenchmarkSetting) -> dict[str, Any]:
     """Return the scores of a setting in the paper's units, per scene and on average, with the published values."""
     runs, formats = results.of(problem), results.formats
@@ -136,6 +138,11 @@ def problem_data(results: Results, problem: BenchmarkSetting) -> dict[str, Any]:
         rows += rows_of(about, having, runs, scores, formats)
     facts = [fact for fact in FACTS if fact.name != "seeds" and fact.shown(rows)]
     mean = SceneSet("mean", places, average_of(problem.dataset, scenes))
+    seconds: dict[str, dict[str, list[float]]] = {method: {} for method in methods}
+    for run in runs:
+        for scene, value in run.seconds.items():
+            if math.isfinite(value):
+                seconds[run.label].setdefault(str(scene), []).append(float(value))
     return {
         "dataset": problem.dataset,
         "scale": problem.scale,
@@ -145,7 +152,10 @@ def problem_data(results: Results, problem: BenchmarkSetting) -> dict[str, Any]:
         "means": [_row(row, facts, formats) for row in rows_of(mean, methods, runs, scores, formats)],
         "rows": [_row(row, facts, formats) for row in rows],
         "facts": [{"name": fact.name, "word": not fact.number} for fact in facts],
-        "seconds": _seconds(runs, methods),
+        "seconds": {  # averaged over seeds
+            method: {scene: sum(values) / len(values) for scene, values in of_method.items()}
+            for method, of_method in seconds.items()
+        },
     }
 
 
@@ -159,19 +169,6 @@ def _row(row: Row, facts: Sequence[Fact], formats: Formats) -> dict[str, Any]:
         "values": {key: [each for each in (cell.mean, cell.spread) if each is not None] for key, cell in cells.items()},
         "counts": counts,
         "paper": {} if counts else {key: value for key, value in row.published.items() if key in formats},
-    }
-
-
-def _seconds(runs: Iterable[Run], methods: Iterable[str]) -> dict[str, dict[str, float]]:
-    """Return the computing time in seconds by method and scene, averaged over seeds."""
-    found: dict[str, dict[str, list[float]]] = {method: {} for method in methods}
-    for run in runs:
-        for scene, seconds in run.seconds.items():
-            if math.isfinite(seconds):
-                found[run.label].setdefault(str(scene), []).append(float(seconds))
-    return {
-        method: {scene: sum(values) / len(values) for scene, values in scenes.items()}
-        for method, scenes in found.items()
     }
 
 

@@ -13,6 +13,7 @@ Over all scenes of a benchmark setting, the expected errors stand beside the mea
 """
 
 import base64
+import contextlib
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
@@ -24,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dsr.evaluation.results import BenchmarkSetting, Results, Run
+from dsr.evaluation.results import BenchmarkSetting, Results
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import BASIS
 from dsr.geometry.surface import normal_mask, shade
@@ -95,16 +96,20 @@ def _scene_data(view: View, stored: DepthSample, pool: PictureStore, notes: list
         "photo": pool.add(np.rint(255 * np.clip(photo, 0, 1)).astype(np.uint8)),
     }
     expected = [each.errors for each in predictions if each.errors is not None]
-    largest = None
+    differences = [depth_error for depth_error, _ in expected]  # whose colours are those of measured ones
     if stored.depth is not None:
-        largest, data["error"] = _error_limits([each.depth - stored.depth for each in predictions])
-    elif expected:  # the colours of expected errors are those of measured ones
-        _, data["error"] = _error_limits([depth_error for depth_error, _ in expected])
+        differences = [each.depth - stored.depth for each in predictions]
+    if stored.depth is not None or expected:
+        # The same for all methods: the largest is the 99.9th percentile of the worst, the limit of the colours the 98th
+        # of the median one.
+        usual = _percentiles(differences, 98)
+        limit = max(float(np.median(usual)) if usual.size else 0.0, _LEAST_ERROR)
+        data["error"] = {"largest": max([limit, *_percentiles(differences, 99.9).tolist()]), "limit": limit}
     if expected:
         depth_errors, angle_errors = zip(*expected, strict=True)
         data["expected"] = {
-            "depth": _largest(depth_errors, _LEAST_ERROR),
-            "angle": _largest(angle_errors, _LEAST_ANGLE),
+            "depth": max([_LEAST_ERROR, *_percentiles(depth_errors, 99.9).tolist()]),
+            "angle": max([_LEAST_ANGLE, *_percentiles(angle_errors, 99.9).tolist()]),
         }
     size_lr = f"{stored.camera_lr.width} x {stored.camera_lr.height}"
     surfaces = [
@@ -112,8 +117,8 @@ def _scene_data(view: View, stored: DepthSample, pool: PictureStore, notes: list
     ]
     for each in predictions:
         surface = _surface(each.depth, stored.camera, data, pool)
-        if stored.depth is not None and largest is not None:
-            surface["error"] = _error(each.depth - stored.depth, largest, pool)
+        if stored.depth is not None:
+            surface["error"] = _error(each.depth - stored.depth, data["error"]["largest"], pool)
         if each.errors is not None:
             surface["expected"] = _expected(each.depth, each.errors, data["expected"], pool)
         surfaces.append({"label": each.run.label, "kind": "method", "text": f"seed {each.run.seed}", **surface})
@@ -169,27 +174,10 @@ def _expected(
     return stored | _mask(valid["depth"], valid["angle"], pool)
 
 
-def _error_limits(differences: Sequence[Tensor]) -> tuple[float, dict[str, float]]:
-    """Return the largest stored error, and the page's error limits; the same for all methods.
-
-    The largest is the 99.9th percentile of the worst method, the limit of the colours the 98th of the median method.
-    """
-    sizes = _sizes(differences)
-    limit = float(np.median([np.percentile(values, 98) for values in sizes])) if sizes else 0.0
-    limit = max(limit, _LEAST_ERROR)
-    largest = _largest(differences, limit)
-    return largest, {"largest": largest, "limit": limit}
-
-
-def _largest(errors: Sequence[Tensor], least: float) -> float:
-    """Return the 99.9th percentile of the errors' sizes for the worst method, at least ``least``."""
-    return max([least, *(float(np.percentile(values, 99.9)) for values in _sizes(errors))])
-
-
-def _sizes(errors: Sequence[Tensor]) -> list[np.ndarray]:
-    """Return the sizes of the known errors of each map that has any."""
+def _percentiles(errors: Sequence[Tensor], share: float) -> np.ndarray:
+    """Return a percentile of the sizes of the known errors of each map that has any."""
     sizes = [error[error.isfinite()].abs().numpy() for error in errors]
-    return [values for values in sizes if values.size]
+    return np.array([np.percentile(values, share) for values in sizes if values.size])
 
 
 def calibration_data(results: Results, problem: BenchmarkSetting) -> list[dict[str, Any]]:
@@ -202,8 +190,12 @@ def calibration_data(results: Results, problem: BenchmarkSetting) -> list[dict[s
     found: dict[str, dict[str, Tensor]] = {}
     step, views = 0, views_of(results, problem)
     for view in views:
-        confident = replace(view, runs=tuple(run for run in view.runs if _is_confident(run, view.scene)))
-        stored = stored_sample(confident, []) if confident.runs else None
+        runs = []  # with expected errors of the scene
+        for run in view.runs:
+            with contextlib.suppress(ValueError):  # a damaged file has none, and is noted with its pictures
+                runs += [run] if run.expected_errors(view.scene) is not None else []
+        confident = replace(view, runs=tuple(runs))
+        stored = stored_sample(confident, []) if runs else None
         if stored is None or stored.depth is None or min(stored.depth.shape[-2:]) < 2:
             continue
         step = step or math.ceil(stored.depth.numel() * len(views) / _MOST_PIXELS)
@@ -220,14 +212,6 @@ def calibration_data(results: Results, problem: BenchmarkSetting) -> list[dict[s
         for label, of in found.items()
         if shared
     ]
-
-
-def _is_confident(run: Run, scene: str) -> bool:
-    """Return whether a run has expected errors of a scene; a damaged file has none, and is noted with its pictures."""
-    try:
-        return run.expected_errors(scene) is not None
-    except ValueError:
-        return False
 
 
 def _agreement(errors: Tensor) -> dict[str, dict[str, Any]]:

@@ -161,7 +161,9 @@ def sets_of_summary(
     whose runs have different truths of the same scenes, are not averaged with others.
     """
     datasets = list(dict.fromkeys(place.dataset for place in places))
-    found = [each for name in datasets for each in _averages_of_dataset(name, _within(places, name))]
+    found: list[SceneSet] = []
+    for name in datasets:
+        found += _averages_of_dataset(name, [place for place in places if place.dataset == name])
     found += _averages_of_paper(places)
     if any(name not in PAPER_SCENES for name in datasets):
         others = [place for place in places if place.dataset not in (*PAPER_SCENES, *apart)]
@@ -176,13 +178,9 @@ def sets_of_summary(
     return list(distinct.values())
 
 
-def _within(places: Sequence[Place], dataset: str) -> list[Place]:
-    return [place for place in places if place.dataset == dataset]
-
-
 def _of_paper(places: Sequence[Place], dataset: str) -> list[Place]:
     """Return the scenes that the paper averages over, including the stand-in if Lucy is missing."""
-    own = _within(places, dataset)
+    own = [place for place in places if place.dataset == dataset]
     paper_scenes = PAPER_SCENES.get(dataset, ())
     stand_in = dataset == "simgeo" and Place(dataset, "lucy") not in own
     return [place for place in own if place.scene in paper_scenes or (stand_in and place.scene == STAND_IN)]

@@ -177,8 +177,7 @@ def _after(result: ViewedResult, vertices: int, limits: Mapping[str, tuple[float
     known = np.isfinite(grid.depth)
     errors = {}
     for name, values in (("depth", result.depth_error), ("angle", result.angle_error)):
-        fitted = np.where(known, reduce_errors(values, grid.factor), np.nan)
-        errors[name] = error_levels(fitted, *limits[name])
+        errors[name] = _error_levels(values, known, grid.factor, *limits[name])
     doubtful = reduce_mask(left_out, grid.factor) & known
     return replace(grid, doubtful=doubtful, certain=certain, errors=errors)
 
@@ -229,14 +228,22 @@ def reduce_depth(depth: np.ndarray, factor: int) -> np.ndarray:
         return np.where(hole, np.nan, near.sum(axis=-1) / total)
 
 
-def reduce_errors(errors: np.ndarray, factor: int) -> np.ndarray:
-    """Reduce errors, (H, W), by the mean of the known ones in each block; NaN where there is none."""
-    if factor == 1:
-        return errors.astype(np.float64)
-    blocks = _blocks(errors.astype(np.float64), factor)
-    known = np.isfinite(blocks)
-    with np.errstate(invalid="ignore"):
-        return np.where(known, blocks, 0).sum(axis=-1) / known.sum(axis=-1)
+def _error_levels(errors: np.ndarray, there: np.ndarray, factor: int, low: float, high: float) -> np.ndarray:
+    """Reduce errors, (H, W), by the mean of the known ones in each block, and return them on a logarithmic scale.
+
+    They are uint8: 1 is ``low`` or less, 255 ``high`` or more, 0 unknown or where no pixel is ``there``.
+    """
+    means = errors.astype(np.float64)
+    if factor > 1:
+        blocks = _blocks(means, factor)
+        known = np.isfinite(blocks)
+        with np.errstate(invalid="ignore"):
+            means = np.where(known, blocks, 0).sum(axis=-1) / known.sum(axis=-1)
+    known = there & np.isfinite(means)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.log(np.maximum(means, low) / low) / np.log(high / low)
+    levels = 1 + np.rint((ERROR_LEVELS - 1) * np.clip(np.where(known, share, 0), 0, 1))
+    return np.where(known, levels, 0).astype(np.uint8)
 
 
 def reduce_mask(mask: np.ndarray, factor: int) -> np.ndarray:
@@ -251,15 +258,6 @@ def find_joints(depth: np.ndarray, factor: int) -> Joints:
     two. Cuts found in the reduced map would be too many: the larger the pixels, the more a surface bends between them.
     """
     return _joined_along(depth, factor), _joined_along(depth.T, factor).T
-
-
-def error_levels(errors: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Return errors, (h, w), on a logarithmic scale as uint8: 1 is ``low`` or less, 255 ``high`` or more, 0 unknown."""
-    known = np.isfinite(errors)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.log(np.maximum(errors, low) / low) / np.log(high / low)
-    levels = 1 + np.rint((ERROR_LEVELS - 1) * np.clip(np.where(known, share, 0), 0, 1))
-    return np.where(known, levels, 0).astype(np.uint8)
 
 
 def pack_grid(grid: Grid) -> tuple[dict[str, Any], str]:

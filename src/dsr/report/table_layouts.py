@@ -244,7 +244,7 @@ def _score_table(run: Run, wide: pd.DataFrame, columns: Formats) -> Table:
         notes.append(implementation_note([paper_name(run)]))
     if len(ours) > 1:
         rows.append(("mean", ours.mean(), paper_row(average_of(run.dataset, scenes), [run], scenes)))
-    table = _terminal_table(f"{_about(run)} - {describe_directions(columns)}", "\n".join(filter(None, notes)))
+    table = _terminal_table(run, f" - {describe_directions(columns)}", "\n".join(filter(None, notes)))
     table.add_column("scene", overflow="fold")
     table.add_column("from")
     for column in columns.values():
@@ -263,7 +263,7 @@ def _score_table(run: Run, wide: pd.DataFrame, columns: Formats) -> Table:
 
 def _family_table(run: Run, wide: pd.DataFrame, families: Mapping[str, Formats]) -> Table:
     """Build a terminal table with a row a metric: its mean, least and largest value of the scenes."""
-    table = _terminal_table(_about(run), alignment_note([run]))
+    table = _terminal_table(run, "", alignment_note([run]))
     for name in ("family", "metric", "better"):
         table.add_column(name)
     for name in ("mean", "least", "most"):
@@ -277,12 +277,8 @@ def _family_table(run: Run, wide: pd.DataFrame, families: Mapping[str, Formats])
     return table
 
 
-def _about(run: Run) -> str:
-    """Return a line on a run."""
-    return f"{run.label} on {run.dataset}, x{run.scale}, {run.downsampling} downsampling"
-
-
-def _terminal_table(title: str, caption: str) -> Table:
+def _terminal_table(run: Run, values: str, caption: str) -> Table:
+    title = f"{run.label} on {run.dataset}, x{run.scale}, {run.downsampling} downsampling{values}"
     table = Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.caption, table.caption_justify = escape(caption) or None, "left"
     return table

@@ -92,11 +92,6 @@ class _Option:
         return self.flags.split()[0]
 
     @property
-    def by_place(self) -> bool:
-        """Whether it is an argument without a flag."""
-        return not self.flags.startswith("-")
-
-    @property
     def key(self) -> str:
         """Where argparse keeps it."""
         long = [flag for flag in self.flags.split() if flag.startswith("--")]
@@ -177,7 +172,7 @@ def add_options(place: Any, record: type[Options], *, needed: bool = True) -> No
             add_options(inner, each.kind, needed=needed and not each.optional)
             continue
         keywords: dict[str, Any] = {"help": each.help.replace("%", "%%"), "default": SUPPRESS}
-        if needed and each.required and not each.by_place:
+        if needed and each.required and each.flags.startswith("-"):
             keywords["required"] = True
         if each.kind is bool:
             keywords["action"] = "store_false" if each.default is True else "store_true"
@@ -192,7 +187,7 @@ def _of_values(each: _Option) -> dict[str, Any]:
         keywords["action"] = "append"
     if each.parse is not None:
         return keywords
-    kinds, left_out = get_args(each.kind), each.by_place and not each.required
+    kinds, left_out = get_args(each.kind), not (each.flags.startswith("-") or each.required)
     if get_origin(each.kind) is Literal:
         return {**keywords, "choices": kinds}
     if get_origin(each.kind) is not tuple:

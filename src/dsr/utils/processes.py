@@ -5,6 +5,7 @@ that call functions of items; if one is killed, new ones take over, once.
 """
 
 import contextlib
+import functools
 import gc
 import hashlib
 import multiprocessing
@@ -121,14 +122,16 @@ class Pool:
         say: Callable[[str], object] = lambda _: None,
     ) -> None:
         # as bytes, which a worker takes in at once: else each one would be waited for until it has imported all of it
-        self._plan = (pickle.dumps((prepare, arguments)), threads)
-        self._count, self._say = count, say
+        plan = (pickle.dumps((prepare, arguments)), threads)
+        context = multiprocessing.get_context("spawn")
+        self._new_executor = functools.partial(ProcessPoolExecutor, count, context, _begin, plan)
+        self._say = say
         self._executors: list[ProcessPoolExecutor] = []
 
     def __enter__(self) -> Self:
         """Return itself."""
         self._others = set(multiprocessing.active_children())
-        self._executors.append(self._executor())
+        self._executors.append(self._new_executor())
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -182,10 +185,7 @@ class Pool:
             if len(self._executors) > 1:
                 raise ChildProcessError(_LOST)
             self._say("a worker process was killed; others begin again what it left")
-            self._executors.append(self._executor())
-
-    def _executor(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(self._count, multiprocessing.get_context("spawn"), _begin, self._plan)
+            self._executors.append(self._new_executor())
 
 
 def _begin(plan: bytes, threads: int | None) -> None:

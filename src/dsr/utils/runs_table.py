@@ -32,7 +32,11 @@ SCORES = {
 def list_run(writer: SummaryWriter, kind: Kind, settings: Mapping[str, Any], scores: Mapping[str, float]) -> None:
     """Put a run into the table of runs; settings of other names are left out, and absent ones are a dash."""
     given = {**settings, "kind": kind}
-    values = {name: given[name] if name in _NUMBERS else _text(given.get(name)) for name in COLUMNS}
+    values = {}
+    for name in COLUMNS:
+        value = given.get(name)
+        text = "-" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+        values[name] = value if name in _NUMBERS else text
     types = {name: DataType.DATA_TYPE_FLOAT64 if name in _NUMBERS else DataType.DATA_TYPE_STRING for name in COLUMNS}
     experiment = Experiment(
         hparam_infos=[HParamInfo(name=name, type=type_, differs=name in _COMPARED) for name, type_ in types.items()],
@@ -52,9 +56,3 @@ def list_scores(writer: SummaryWriter, scores: Mapping[str, float], step: int = 
     """Write the scores of a run that is in the table of runs, in place of those of earlier steps."""
     for name, value in scores.items():
         writer.add_scalar(f"score/{name}", value, step)
-
-
-def _text(value: Any) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -62,8 +62,14 @@ def build_study(
     if not scenes:
         detail = f"; {notes[-1]}" if notes else ""
         raise ValueError(f"study: expected a scene with its ground truth and {_FEWEST} methods, found none{detail}")
-    per_person = _within("scenes per person", choice.scenes_per_person, 1, len(scenes), len(scenes))
-    repeat = _within("repeat", choice.repeat, 0, per_person, 0)
+    per_person = len(scenes) if choice.scenes_per_person is None else choice.scenes_per_person
+    repeat = choice.repeat or 0
+    for what, value, low, high in (
+        ("scenes per person", per_person, 1, len(scenes)),
+        ("repeat", repeat, 0, per_person),
+    ):
+        if not low <= value <= high:
+            raise ValueError(f"{what}: expected {low} to {high}, got {value}")
     asked: dict[str, Any] = {"perPerson": per_person, "repeat": repeat, "scenes": scenes}
     study = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:_DIGITS]
     key = Key(study, choice.light, per_person, repeat, trials)
@@ -181,12 +187,3 @@ def _hash(*parts: bytes) -> str:
     for part in parts:
         digest.update(len(part).to_bytes(8, "big") + part)
     return digest.hexdigest()[:_DIGITS]
-
-
-def _within(what: str, value: int | None, low: int, high: int, default: int) -> int:
-    """Return the value if it is within a range, or the default for None."""
-    if value is None:
-        return default
-    if not low <= value <= high:
-        raise ValueError(f"{what}: expected {low} to {high}, got {value}")
-    return value
