@@ -17,6 +17,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
+from torch import Tensor
+
 from dsr.data.frame_files import (
     expect_size,
     given_camera,
@@ -48,6 +50,11 @@ def find_frames(root: Path) -> dict[str, tuple[Path]]:
     return in_natural_order(found)
 
 
+def read_depth(path: Path) -> Tensor:
+    """Return a depth picture, (1, H, W) float64 in metres, NaN in holes."""
+    return to_depth(path, turn_back_bits(str(path), read_16bit(path), SUNRGBD_BITS) / 1000)
+
+
 def load_frame(
     folder: Path, dataset: str, name: str, *, refined: bool = False, intrinsics: Intrinsics | None = None
 ) -> Scene:
@@ -67,8 +74,7 @@ def load_frame(
 
 def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str, intrinsics: Path | Intrinsics) -> Scene:
     """Return the scene of two files, wherever they lie, and of their intrinsics or the file that has them."""
-    rgb = read_picture(rgb_path)
-    depth = to_depth(depth_path, turn_back_bits(str(depth_path), read_16bit(depth_path), SUNRGBD_BITS) / 1000)
+    rgb, depth = read_picture(rgb_path), read_depth(depth_path)
     size = (rgb.shape[1], rgb.shape[2])
     expect_size(depth_path, depth, size)
     if isinstance(intrinsics, Path):
