@@ -105,7 +105,12 @@ def load_capture(
 ) -> Scene:
     """Return a capture, with the depth of the clear objects as measured at x1, and that of their twins as the truth."""
     rgb, measured, truth = read_picture(rgb_path), read_depth(measured_path), read_depth(truth_path)
-    camera = read_camera(camera_path)
+    entries = dict(_ENTRY.findall(read_text(camera_path)))
+    try:
+        width, height, *intrinsics = (float(entries[key]) for key in _KEYS)
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{camera_path}: expected a number at each of {', '.join(_KEYS)}, got {entries}") from error
+    camera = given_camera(intrinsics, (round(height), round(width)), camera_path)  # pixel centres at integers
     size = (camera.height, camera.width)
     for path, image in ((rgb_path, rgb), (measured_path, measured), (truth_path, truth)):
         expect_size(path, image, size)
@@ -149,16 +154,6 @@ def read_regions(path: Path, size: Sequence[int]) -> dict[str, Tensor]:
     edges = cv2.dilate(mask, disc) - cv2.erode(mask, disc)
     regions = {"glass": mask, "outside": 1 - mask, "edges": edges}
     return {name: torch.from_numpy(each)[None] for name, each in regions.items()}
-
-
-def read_camera(path: Path) -> Camera:
-    """Return the camera of a ``camera_intrinsics.yaml``, pixel centres at integers."""
-    found = dict(_ENTRY.findall(read_text(path)))
-    try:
-        width, height, *intrinsics = (float(found[key]) for key in _KEYS)
-    except (KeyError, ValueError) as error:
-        raise ValueError(f"{path}: expected a number at each of {', '.join(_KEYS)}, got {found}") from error
-    return given_camera(intrinsics, (round(height), round(width)), path)
 
 
 DETECTED = ((find_captures, load_capture, "cleargrasp"), (find_renderings, load_rendering, "cleargrasp_synthetic"))

@@ -27,6 +27,7 @@ from torch import Tensor
 from dsr.data.frame_files import (
     expect_size,
     find_beside,
+    given_camera,
     in_natural_order,
     read_16bit,
     read_picture,
@@ -85,7 +86,7 @@ def load_matrices(path: Path, dataset: str, name: str) -> Scene:
     if stored["rgb"].dtype != np.uint8:
         raise ValueError(f"{path}: rgb: expected 8 bits a channel, got {stored['rgb'].dtype}")
     rgb = torch.from_numpy(np.ascontiguousarray(stored["rgb"].transpose(2, 0, 1))).float() / 255
-    camera = _camera(path, stored["calib"].T)
+    camera = to_camera(path, stored["calib"].T - np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]]), SIZE)  # pixels from 1
     masks = {key: stored[key] for key in _MASKS if key in stored and stored[key].size}
     return _scene(path, rgb, camera, stored["depth"], masks, dataset, name)
 
@@ -103,13 +104,8 @@ def load_pictures(rgb_path: Path, depth_path: Path, calibration_path: Path, *pat
         fx, fy, cx, cy = map(float, text.replace(",", " ").split())
     except ValueError as error:
         raise ValueError(f"{calibration_path}: expected fx,fy,cx,cy, got {text[:60]!r}") from error
-    camera = _camera(calibration_path, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+    camera = given_camera((fx, fy, cx - 1, cy - 1), SIZE, calibration_path)  # pixels are counted from 1
     return _scene(depth_path, rgb, camera, depth * (FARTHEST / 65535), masks, str(dataset), str(name))
-
-
-def _camera(path: Path, matrix: np.ndarray) -> Camera:
-    """Return the camera of intrinsics whose pixels are counted from 1."""
-    return to_camera(path, matrix - np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]]), SIZE)
 
 
 def _scene(

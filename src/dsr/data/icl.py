@@ -17,8 +17,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
-from torch import Tensor
-
 from dsr.data.frame_files import expect_size, name_of, read_16bit, read_picture, to_depth, walk
 from dsr.data.scene_source import Preparation, PreparedDataset, SceneSelection, make_records, rename_frames
 from dsr.geometry.camera import from_range
@@ -53,18 +51,16 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
     return found
 
 
-def read_depth(path: Path) -> Tensor:
-    """Return a ``.depth`` or ``.png`` file as orthogonal depth, (1, 480, 640) float64 in metres, NaN in holes."""
-    if path.suffix.lower() == ".depth":
-        return from_range(to_depth(path, read_depth_file(path) / 100, FARTHEST), CAMERA, "perspective")
-    levels = read_16bit(path)
-    expect_size(path, levels, _SIZE)
-    return to_depth(path, levels / LEVELS)
-
-
 def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Scene:
-    """Return one frame at 640 x 480."""
-    return Scene(dataset, name, read_picture(rgb_path, _SIZE), CAMERA, read_depth(depth_path))
+    """Return one frame at 640 x 480; a ``.depth`` file has distances along the ray in centimetres."""
+    rgb = read_picture(rgb_path, _SIZE)
+    if depth_path.suffix.lower() == ".depth":
+        depth = from_range(to_depth(depth_path, read_depth_file(depth_path) / 100, FARTHEST), CAMERA, "perspective")
+    else:
+        levels = read_16bit(depth_path)
+        expect_size(depth_path, levels, _SIZE)
+        depth = to_depth(depth_path, levels / LEVELS)
+    return Scene(dataset, name, rgb, CAMERA, depth)
 
 
 FRAMES = MappingProxyType(

@@ -80,7 +80,7 @@ def resize_depth(depth: Tensor, height: int, width: int) -> Tensor:
     own = inverse[rows.nearest][:, columns.nearest]
     shift_y, shift_x = (rows.nearest - rows.centre)[:, None], (columns.nearest - columns.centre)[None]
     sums = [torch.zeros_like(own) for _ in range(9)]
-    for step_y, step_x in itertools.product(rows.steps(), columns.steps()):
+    for step_y, step_x in itertools.product(rows.steps, columns.steps):
         row, weight_y = rows.neighbour(step_y)
         column, weight_x = columns.neighbour(step_x)
         values = inverse[row][:, column]
@@ -100,12 +100,9 @@ class _Axis:
         self.radius = max(old / new, _MIN_RADIUS)
         self.centre = (torch.arange(new, dtype=torch.float64) + 0.5) * (old / new) - 0.5
         self.nearest = self.centre.round().long().clamp(0, old - 1)
-        self._old = old
-
-    def steps(self) -> range:
-        """Return the offsets from the nearest old pixel that may have a weight."""
         most = math.ceil(self.radius + 0.5) - 1
-        return range(-most, most + 1)
+        self.steps = range(-most, most + 1)  # offsets from the nearest old pixel that may have a weight
+        self._old = old
 
     def neighbour(self, step: int) -> tuple[Tensor, Tensor]:
         """Return the old pixels ``step`` from the nearest ones, and their weights, which are 0 beyond the border."""

@@ -50,7 +50,8 @@ class Procedural(SceneSource):
 
         All processors take part if it takes longer than a few seconds.
         """
-        missing = [scene for scene in scenes if not (cache_directory() / self._path(scene)).is_file()]
+        folder = cache_directory() / self._series
+        missing = [scene for scene in scenes if not (folder / f"{scene}.npz").is_file()]
         yield from (scene for scene in scenes if scene not in missing)
         begun = time.perf_counter()
         for number, scene in enumerate(missing, start=1):
@@ -67,10 +68,8 @@ class Procedural(SceneSource):
 
     def _render(self, scene: str) -> Rendering:
         """Return a scene from the cache, into which it is rendered unless it is there."""
-        return load_or_render(self._path(scene), lambda: render_random_scene(self._seed, int(scene), self._size))
-
-    def _path(self, scene: str) -> Path:
-        return Path(self._series, f"{scene}.npz")
+        path = Path(self._series, f"{scene}.npz")
+        return load_or_render(path, lambda: render_random_scene(self._seed, int(scene), self._size))
 
 
 class SimGeo(SceneSource):

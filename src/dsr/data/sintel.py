@@ -19,11 +19,9 @@ from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
-from torch import Tensor
 
 from dsr.data.frame_files import expect_size, read_picture, to_camera, to_depth
 from dsr.data.scene_source import Preparation, PreparedDataset, SceneSelection, make_records
-from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.utils.guards import MOST_FILE, natural_key, read_limited
 
@@ -53,25 +51,6 @@ def find_frames(root: Path, rendering: Literal["clean", "final"] = "final") -> d
     return found
 
 
-def read_depth(path: Path, farthest: float = FARTHEST) -> Tensor:
-    """Return a ``.dpt`` file, (1, H, W) float64 in metres, NaN where it is beyond ``farthest`` metres."""
-    content = _tagged(path, _DPT_HEADER.size)
-    _, width, height = _DPT_HEADER.unpack_from(content)
-    length = len(content) - _DPT_HEADER.size
-    if width < 1 or height < 1 or length != 4 * width * height:
-        raise ValueError(f"{path}: expected {height} x {width} float32 depths behind the header, got {length} bytes")
-    values = np.frombuffer(content, "<f4", offset=_DPT_HEADER.size).reshape(height, width)
-    return to_depth(path, values, farthest)
-
-
-def read_camera(path: Path, size: tuple[int, int]) -> Camera:
-    """Return the intrinsics of a ``.cam`` file for pictures of ``size`` = (height, width)."""
-    content = _tagged(path, _CAM_LENGTH)
-    if len(content) > _CAM_LENGTH:
-        raise ValueError(f"{path}: expected {_CAM_LENGTH} bytes, got {len(content)}")
-    return to_camera(path, np.frombuffer(content, "<f8", count=9, offset=4).reshape(3, 3), size)
-
-
 def _tagged(path: Path, least: int) -> bytes:
     """Return the content of a file that begins with the tag and has at least so many bytes."""
     content = read_limited(path, MOST_FILE)
@@ -85,10 +64,21 @@ def load_frame(
     rgb_path: Path, depth_path: Path, camera_path: Path, dataset: str, name: str, *, farthest: float = FARTHEST
 ) -> Scene:
     """Return one frame; depths beyond ``farthest`` metres are holes."""
-    rgb, depth = read_picture(rgb_path), read_depth(depth_path, farthest)
+    rgb, content = read_picture(rgb_path), _tagged(depth_path, _DPT_HEADER.size)
+    _, width, height = _DPT_HEADER.unpack_from(content)
+    length = len(content) - _DPT_HEADER.size
+    if width < 1 or height < 1 or length != 4 * width * height:
+        expected = f"{height} x {width} float32 depths behind the header"
+        raise ValueError(f"{depth_path}: expected {expected}, got {length} bytes")
+    values = np.frombuffer(content, "<f4", offset=_DPT_HEADER.size).reshape(height, width)
+    depth = to_depth(depth_path, values, farthest)
     size = (rgb.shape[1], rgb.shape[2])
     expect_size(depth_path, depth, size)
-    return Scene(dataset, name, rgb, read_camera(camera_path, size), depth)
+    content = _tagged(camera_path, _CAM_LENGTH)
+    if len(content) > _CAM_LENGTH:
+        raise ValueError(f"{camera_path}: expected {_CAM_LENGTH} bytes, got {len(content)}")
+    camera = to_camera(camera_path, np.frombuffer(content, "<f8", count=9, offset=4).reshape(3, 3), size)
+    return Scene(dataset, name, rgb, camera, depth)
 
 
 # The 58 frames to train on: those at a third and two thirds of each sequence, and the first of twelve sequences

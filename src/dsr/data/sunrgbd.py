@@ -59,12 +59,17 @@ def load_frame(
     folder: Path, dataset: str, name: str, *, refined: bool = False, intrinsics: Intrinsics | None = None
 ) -> Scene:
     """Return the scene of a folder; ``intrinsics`` are for one without ``intrinsics.txt``."""
-    rgb_path, depth_path = _only(folder / "image"), _only(folder / ("depth_bfx" if refined else "depth"))
+    paths = []
+    for place in (folder / "image", folder / ("depth_bfx" if refined else "depth")):
+        found = sorted(path for path in place.glob("*") if path.suffix.lower() in _PICTURES)
+        if len(found) != 1:
+            raise ValueError(f"{place}: expected one picture ({', '.join(_PICTURES)}), got {len(found)}")
+        paths += found
     matrix = folder / "intrinsics.txt"
     given = matrix if matrix.is_file() else intrinsics
     if given is None:
         raise ValueError(f"{folder}: expected intrinsics.txt, or intrinsics=(fx, fy, cx, cy) instead, got neither")
-    return load_pair(rgb_path, depth_path, dataset, name, given)
+    return load_pair(paths[0], paths[1], dataset, name, given)
 
 
 def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str, intrinsics: Path | Intrinsics) -> Scene:
@@ -77,14 +82,6 @@ def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str, intrins
     else:
         camera = given_camera(intrinsics, size)
     return Scene(dataset, name, rgb, camera, depth)
-
-
-def _only(folder: Path) -> Path:
-    """Return the one picture in a folder."""
-    found = sorted(path for path in folder.glob("*") if path.suffix.lower() in _PICTURES)
-    if len(found) != 1:
-        raise ValueError(f"{folder}: expected one picture ({', '.join(_PICTURES)}), got {len(found)}")
-    return found[0]
 
 
 # Folders of the scenes; where several scenes lie below one, its first is used

@@ -12,7 +12,6 @@ import re
 from pathlib import Path
 
 import numpy as np
-from torch import Tensor
 
 from dsr.data.frame_files import name_of, read_picture, to_depth, walk
 from dsr.data.scene_source import Preparation, PreparedDataset, SceneSelection, make_records
@@ -42,17 +41,12 @@ def find_frames(root: Path) -> dict[str, tuple[Path, Path]]:
     return found
 
 
-def read_depth(path: Path, farthest: float = FARTHEST) -> Tensor:
-    """Return a depth file, (1, 480, 640) float64 in metres, NaN where it is beyond ``farthest`` metres."""
-    values = read_values(path)
-    if (values.shape, values.dtype) != (_SIZE, np.dtype("<f4")):
-        raise ValueError(f"{path}: expected 480 x 640 float32, got {values.dtype} of shape {values.shape}")
-    return to_depth(path, values, farthest)
-
-
 def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str, *, farthest: float = FARTHEST) -> Scene:
     """Return one frame at 640 x 480; depths beyond ``farthest`` metres are holes."""
-    return Scene(dataset, name, read_picture(rgb_path, _SIZE), CAMERA, read_depth(depth_path, farthest))
+    rgb, values = read_picture(rgb_path, _SIZE), read_values(depth_path)
+    if (values.shape, values.dtype) != (_SIZE, np.dtype("<f4")):
+        raise ValueError(f"{depth_path}: expected 480 x 640 float32, got {values.dtype} of shape {values.shape}")
+    return Scene(dataset, name, rgb, CAMERA, to_depth(depth_path, values, farthest))
 
 
 DETECTED = ((find_frames, load_frame, "tartanair"),)

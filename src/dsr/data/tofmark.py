@@ -106,18 +106,19 @@ def read_matrices(
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
     """Return the picture, (3, H, W) float32 in [0, 1], and depth and samples, (1, H, W) float64 in metres, or None."""
     found = read_variables(path)
+    listed = ", ".join(f"{name} {' x '.join(map(str, array.shape))}" for name, array in found.items()) or "no matrix"
     chosen = dict(variables or {})
     for role, name in chosen.items():
         if role not in _ROLES:
             raise ValueError(f"variables: expected {', '.join(_ROLES)}, got {role}")
         if name not in found:
-            raise ValueError(f"{path}: expected the variable {name}, got {_listed(found)}")
+            raise ValueError(f"{path}: expected the variable {name}, got {listed}")
     for role in _ROLES:
         fitting = chosen.get(role) or _fitting_variable(path, role, found, chosen)
         if fitting is not None:
             chosen[role] = fitting
     if "intensity" not in chosen or len(chosen) == 1:
-        raise ValueError(f"{path}: expected an intensity image and depth or samples of its size, got {_listed(found)}")
+        raise ValueError(f"{path}: expected an intensity image and depth or samples of its size, got {listed}")
     rgb = _picture(path, chosen["intensity"], found[chosen["intensity"]])
     maps = {role: _depth(path, chosen[role], found, rgb) for role in ("depth", "samples") if role in chosen}
     return rgb, maps.get("depth"), maps.get("samples")
@@ -176,11 +177,6 @@ def _depth(path: Path, name: str, found: Mapping[str, np.ndarray], rgb: Tensor) 
     known = values[values > 0]
     unit = 1e-3 if known.size and np.median(known) > _MILLIMETRES else 1.0
     return to_depth(path, values * unit)
-
-
-def _listed(found: Mapping[str, np.ndarray]) -> str:
-    """Return variables and their shapes in one line."""
-    return ", ".join(f"{name} {' x '.join(map(str, array.shape))}" for name, array in found.items()) or "no matrix"
 
 
 SCENES = ("books", "devil", "shark")

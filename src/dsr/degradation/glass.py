@@ -211,11 +211,12 @@ def _paint_clear(
     rgb: Tensor, body: Body, radius: float, *, solid: bool, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Return the photo of a clear object in its window, and how much of a cue for sensors each pixel is, (h, w)."""
-    bumps = []
-    if chance(0.1 if solid else 0.4, generator):
+    front, back = body.front, body.back
+    if chance(0.1 if solid else 0.4, generator):  # bumps along u and v
         waves, size = uniform(0.01, 0.08, generator), uniform(2, 8, generator)
-        bumps = [waves * field_of(body.near[None], size, generator)[0] for _ in range(2)]
-    front = _unit(body.front, bumps)
+        bumps = torch.stack([waves * field_of(body.near[None], size, generator)[0] for _ in range(2)])
+        front, back = (torch.cat((normals[:2] + bumps, normals[2:])) for normals in (front, back))
+        front, back = front / front.norm(dim=0), back / back.norm(dim=0)
     room = _Room(rgb, front, body.mask, generator)
     facing = front[2].clamp(0.02, 1)
     turned = 1 + uniform(0.3, 1, generator)  # a full object shows what is behind upside down
@@ -231,29 +232,15 @@ def _paint_clear(
     rim = ((0.55 - facing) / 0.55).clamp(min=0) ** uniform(1, 2.5, generator) * uniform(0.3, 1, generator)
     painted = torch.lerp(painted, room.walls(front * 1.5) * uniform(0.3, 1.7, generator), rim)
     bright = torch.zeros_like(facing)
-    for normals, weight in ((front, 1.0), (_unit(body.back, bumps), 0.5)):
-        share = weight * _fresnel(normals[2])
+    for normals, weight in ((front, 1.0), (back, 0.5)):
+        # the share of light that is reflected by the cosine of the angle of incidence (Schlick, 1994)
+        share = weight * (_REFLECTED + (1 - _REFLECTED) * (1 - normals[2].clamp(0, 1)) ** 5)
         lights = share.clamp(max=0.15) * room.lights(normals)
         painted = painted * (1 - share) + share * room.walls(normals) + lights
         bright += lights.mean(dim=0)
     line = body.lines * uniform(0.1, 0.6, generator)
     painted = torch.lerp(painted, room.mean * uniform(0.3, 2, generator) + uniform(0, 0.15, generator), line)
     return painted.clamp(0, 1), (bright + 0.7 * rim + 0.5 * body.lines).clamp(0, 1)
-
-
-def _unit(normals: Tensor, bumps: list[Tensor]) -> Tensor:
-    """Return unit normals, with bumps along u and v."""
-    if not bumps:
-        return normals
-    moved = normals.clone()
-    moved[0] += bumps[0]
-    moved[1] += bumps[1]
-    return moved / moved.norm(dim=0)
-
-
-def _fresnel(facing: Tensor, least: float = _REFLECTED) -> Tensor:
-    """Return the share of light that is reflected (Schlick, 1994), by the cosine of the angle of incidence."""
-    return least + (1 - least) * (1 - facing.clamp(0, 1)) ** 5
 
 
 def _sample(rgb: Tensor, window: Body | Plate, right: Tensor, down: Tensor) -> Tensor:
@@ -302,7 +289,7 @@ def _paint_gloss(rgb: Tensor, body: Body, generator: torch.Generator) -> tuple[T
         lit = ((side / side.norm()).mul(body.front).sum(dim=0) * side[2].sign()).clamp(min=0)
         albedo = (uniform(0.05, 0.8, generator) + 0.15 * torch.randn((3, 1, 1), generator=generator)).clamp(0.02, 1)
         base, least = albedo * (0.3 + uniform(0.3, 0.9, generator) * lit), power(-1.4, -0.7, generator)
-    share = _fresnel(body.front[2], least)
+    share = least + (1 - least) * (1 - body.front[2].clamp(0, 1)) ** 5  # Schlick's, as of clear objects
     shine = shine * share.clamp(max=0.5)
     painted = base * (1 - 0.5 * share) + 0.5 * share * room.walls(body.front) + shine
     return painted.clamp(0, 1), shine.mean(dim=0).clamp(0, 1)
@@ -355,14 +342,12 @@ def _reflect(state: _State, plate: Plate, surface: Tensor, generator: torch.Gene
     own_v, own_u = (torch.arange(each.start, each.stop) for each in (plate.rows, plate.columns))
     right = u - smaller * plate.right - own_u
     down = v + smaller * plate.down - own_v[:, None]
-    rows, columns = _within(own_v[:, None] + down, height), _within(own_u + right, width)
+    whole = []
+    for places, size in ((own_v[:, None] + down, height), (own_u + right, width)):  # turned back at the borders
+        folded = places.round().long().remainder(2 * (size - 1)) if size > 1 else torch.zeros_like(places).long()
+        whole.append(torch.minimum(folded, 2 * (size - 1) - folded))
+    rows, columns = whole
     return _sample(state.rgb, plate, right, down), surface + state.depth[:, rows, columns]
-
-
-def _within(places: Tensor, size: int) -> Tensor:
-    """Return whole places in an image of a size, turned back at its borders as a photo's are."""
-    folded = places.round().long().remainder(2 * (size - 1)) if size > 1 else torch.zeros_like(places).long()
-    return torch.minimum(folded, 2 * (size - 1) - folded)
 
 
 def draw_vessel(pose: Pose, radius: float, size: tuple[int, int], generator: torch.Generator) -> Body | None:

@@ -217,13 +217,13 @@ def recognise_values(depth: Tensor) -> ValueSteps | None:
     depth = depth[:, :: max(1, round(depth.numel() / _PIXELS))]
     values, counts = torch.unique(depth[depth.isfinite()].double(), return_counts=True)
     distinct = values[(counts >= _COMMON) & (values >= _NEAREST)].cpu().numpy()
-
-    def is_rounded(unit: float) -> bool:  # up to the precision of float32
-        multiples = distinct / unit
-        return bool(np.all(np.abs(multiples - np.round(multiples)) <= 1e-3 + 2e-7 * multiples))
-
-    rounding = next(filter(is_rounded, _ROUNDINGS), None)
-    if rounding is None or not len(distinct):
+    if not len(distinct):
+        return None
+    for rounding in _ROUNDINGS:
+        multiples = distinct / rounding
+        if np.all(np.abs(multiples - np.round(multiples)) <= 1e-3 + 2e-7 * multiples):  # as precise as float32
+            break
+    else:
         return None
     found: list[ValueSteps] = []
     low = _CONSTANTS[0]

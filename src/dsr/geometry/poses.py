@@ -42,7 +42,9 @@ def as_rigid(values: Sequence[Sequence[float]] | np.ndarray, name: str) -> Matri
         row = " ".join(f"{value:.4g}" for value in matrix[3])
         raise ValueError(f"{name}: expected 0 0 0 1 as the last row, got {row}{hint}")
     turn = matrix[:3, :3]
-    if not orthonormal_error(turn) <= _TOLERANCE:  # NaN is none either
+    with np.errstate(over="ignore", invalid="ignore"):  # of numbers too large
+        deviation = np.abs(turn @ turn.T - np.eye(3)).max()
+    if not deviation <= _TOLERANCE:  # NaN is none either
         lengths = " ".join(f"{math.hypot(*row):.4g}" for row in turn)
         raise ValueError(f"{name}: expected a rigid transform, got rows of length {lengths} that do not form one")
     if np.linalg.det(turn) < 0:
@@ -51,12 +53,6 @@ def as_rigid(values: Sequence[Sequence[float]] | np.ndarray, name: str) -> Matri
     rigid = np.eye(4)
     rigid[:3, :3], rigid[:3, 3] = left @ right, matrix[:3, 3]
     return rigid
-
-
-def orthonormal_error(turn: np.ndarray) -> float:
-    """Return the largest magnitude in R R' - 1 of a matrix R, (3, 3); infinite or NaN for numbers too large."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.abs(turn @ turn.T - np.eye(3)).max())
 
 
 def from_quaternion(translation: Sequence[float], quaternion: Sequence[float], name: str) -> Matrix:

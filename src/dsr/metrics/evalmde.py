@@ -116,13 +116,13 @@ def wkdr(pair: SurfacePair) -> Tensor:
 @once_per_pair
 def beyond_disparity(pair: SurfacePair) -> Tensor:
     """Return the fraction of pixels with a ratio to the true depth of 1.25^.125 or more, (B,), disparity fitted."""
-    return _beyond(pair, 1 / _aligned(pair, 1 / pair.prediction, 1 / pair.target))
+    return _beyond(pair, inverse=True)
 
 
 @once_per_pair
 def beyond_depth(pair: SurfacePair) -> Tensor:
     """Return the same as :func:`beyond_disparity`, (B,), with depth fitted."""
-    return _beyond(pair, _aligned(pair, pair.prediction, pair.target))
+    return _beyond(pair, inverse=False)
 
 
 def boundary_error(pair: SurfacePair) -> Tensor:
@@ -171,19 +171,18 @@ def _pair_error(rows: Tensor, first: Tensor, second: Tensor) -> Tensor:
     return total / count
 
 
-def _aligned(pair: SurfacePair, values: Tensor, target: Tensor) -> Tensor:
-    """Return values with the factor and offset of least squares to a target, clamped, (B, 1, H, W) in 64 bits."""
+def _beyond(pair: SurfacePair, *, inverse: bool) -> Tensor:
+    """Return the fraction beyond :data:`RATIO`, with depth or its inverse fitted to the truth by least squares."""
+    given = (1 / pair.prediction, 1 / pair.target) if inverse else (pair.prediction, pair.target)
+    values, target = (each.double() for each in given)
     weights = pair.depth_mask.double()
     count = weights.sum(dim=(2, 3), keepdim=True)
-    values, target = values.double(), target.double()
     means = [(each * weights).sum(dim=(2, 3), keepdim=True) / count for each in (values, target)]
     centred = (values - means[0]) * weights
     square = (centred * centred).sum(dim=(2, 3), keepdim=True)
     factor = (centred * (target - means[1])).sum(dim=(2, 3), keepdim=True) / square.clamp(min=1e-300)
-    return ((values - means[0]) * factor + means[1]).clamp(min=NEAREST)
-
-
-def _beyond(pair: SurfacePair, aligned: Tensor) -> Tensor:
+    aligned = ((values - means[0]) * factor + means[1]).clamp(min=NEAREST)
+    aligned = 1 / aligned if inverse else aligned
     ratio = torch.maximum(aligned / pair.target, pair.target / aligned)
     within = ((ratio < RATIO) & pair.depth_mask).sum(dim=(1, 2, 3))
     return 1 - within.double() / pair.target_mask.sum(dim=(1, 2, 3))

@@ -9,7 +9,7 @@ right, y up from the floor, z towards the viewer.
 """
 
 import math
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -239,42 +239,30 @@ def _plain(*rgb: float) -> Field:
     return lambda points: np.broadcast_to(np.array(rgb)[:, None], points.shape)
 
 
-def _mosaic(chart: Field, cell: float, seed: int) -> Field:
+def _mosaic(chart: Field, cell: float, seed: int, points: Array) -> Array:
     """Return a mosaic of small tiles of ``cell`` metres in the coordinates of ``chart``: random hue, dark joints."""
-
-    def paint(points: Array) -> Array:
-        place = chart(points) / cell + 0.5
-        tile = np.floor(place).astype(np.intp)
-        hue = rc.random_table(seed)[tuple(tile & 31)]
-        checker = np.where(tile.sum(0) % 2, 0.35 * hue, 0.45 + 0.55 * hue)
-        edge = np.abs(place - tile - 0.5).max(0)
-        grain = 0.8 + 0.4 * noise(points, 0.006, seed)
-        return np.where(edge > 0.43, 0.10, mix(_CLAY, checker)) * grain
-
-    return paint
+    place = chart(points) / cell + 0.5
+    tile = np.floor(place).astype(np.intp)
+    hue = rc.random_table(seed)[tuple(tile & 31)]
+    checker = np.where(tile.sum(0) % 2, 0.35 * hue, 0.45 + 0.55 * hue)
+    edge = np.abs(place - tile - 0.5).max(0)
+    grain = 0.8 + 0.4 * noise(points, 0.006, seed)
+    return np.where(edge > 0.43, 0.10, mix(_CLAY, checker)) * grain
 
 
-def _marble(chart: Field) -> Field:
+def _marble(chart: Field, points: Array) -> Array:
     """Return fine warped veins through the solid."""
-
-    def paint(points: Array) -> Array:
-        p = chart(points)
-        warp = noise(p, 0.22, 31) + 0.5 * noise(p, 0.09, 32) + 0.25 * noise(p, 0.035, 33)
-        vein = 0.5 + 0.5 * np.sin(130 * (0.35 * p[0] + p[1]) + 17 * warp)
-        return mix(_CLAY, 0.15 + 0.75 * vein) * (0.75 + 0.5 * noise(p, 0.007, 34))
-
-    return paint
+    p = chart(points)
+    warp = noise(p, 0.22, 31) + 0.5 * noise(p, 0.09, 32) + 0.25 * noise(p, 0.035, 33)
+    vein = 0.5 + 0.5 * np.sin(130 * (0.35 * p[0] + p[1]) + 17 * warp)
+    return mix(_CLAY, 0.15 + 0.75 * vein) * (0.75 + 0.5 * noise(p, 0.007, 34))
 
 
-def _blobs(chart: Field, cell: float, seed: int, palette: Array) -> Field:
+def _blobs(chart: Field, cell: float, seed: int, palette: Array, points: Array) -> Array:
     """Return broad blobs of colour, about ``cell`` metres wide."""
-
-    def paint(points: Array) -> Array:
-        p = chart(points) + 3.7 * cell
-        value = 0.7 * noise(rc.TILT @ p, cell, seed, 3) + 0.3 * noise(p, cell / 2, seed + 50, 3)
-        return mix(palette, np.clip(3.2 * value - 1.1, 0, 1))
-
-    return paint
+    p = chart(points) + 3.7 * cell
+    value = 0.7 * noise(rc.TILT @ p, cell, seed, 3) + 0.3 * noise(p, cell / 2, seed + 50, 3)
+    return mix(palette, np.clip(3.2 * value - 1.1, 0, 1))
 
 
 def _weave(points: Array) -> Array:
@@ -286,17 +274,13 @@ def _weave(points: Array) -> Array:
     return mix(np.array([[0.16, 0.20, 0.26], [0.62, 0.60, 0.54]]), stripe) * grain
 
 
-def _unroll_chart(cylinder: rc.Cylinder) -> Field:
-    """Return the chart that maps points to the cylinder's (arc length, height, depth below the side) in metres."""
-
-    def unroll(points: Array) -> Array:
-        x, y, z = cylinder.to_local(points)
-        below = cylinder.radius - np.hypot(x, z)
-        cap = cylinder.half - np.abs(y) < np.abs(below)
-        arc = np.arctan2(z, x) * cylinder.radius
-        return np.where(cap, np.stack((x, z, np.sign(y) + 0 * x)), np.stack((arc, y, 0 * x)))
-
-    return unroll
+def _unroll(cylinder: rc.Cylinder, points: Array) -> Array:
+    """Return the (arc length, height, depth below the side) in metres of points on a cylinder."""
+    x, y, z = cylinder.to_local(points)
+    below = cylinder.radius - np.hypot(x, z)
+    cap = cylinder.half - np.abs(y) < np.abs(below)
+    arc = np.arctan2(z, x) * cylinder.radius
+    return np.where(cap, np.stack((x, z, np.sign(y) + 0 * x)), np.stack((arc, y, 0 * x)))
 
 
 def _stone(points: Array) -> Array:
@@ -332,17 +316,21 @@ def build_scene(name: str) -> rc.World:
     if name.startswith("cube"):
         cube = rc.Box(np.array([0.0, 0.02, 3.1]), rotation(41.0, -31.0, 7.0), np.full(3, 0.44))
         # the faces lie in the middle of a layer of the solid mosaic
-        shown = [Body(cube, _mosaic(cube.to_local, 0.44 / 14, 11) if style == "high" else clay)]
+        shown = [Body(cube, partial(_mosaic, cube.to_local, 0.44 / 14, 11) if style == "high" else clay)]
     else:
         sphere = rc.Sphere(np.array([-0.45, 0.33, 2.84]), np.eye(3), 0.45)
         cylinder = rc.Cylinder(np.array([0.40, -0.03, 3.2]), rotation(0.0, 33.0, 14.0), 0.37, 0.64)
         paints = [clay, clay]
         if style == "high":
-            paints = [_marble(sphere.to_local), _mosaic(_unroll_chart(cylinder), 2 * np.pi * 0.37 / 76, 12)]
+            tiles = partial(_mosaic, partial(_unroll, cylinder), 2 * np.pi * 0.37 / 76, 12)
+            paints = [partial(_marble, sphere.to_local), tiles]
         elif style == "low":
-            paints = [_blobs(sphere.to_local, 0.25, 21, _CLOUD), _blobs(cylinder.to_local, 0.25, 22, _CLOUD)]
+            paints = [
+                partial(_blobs, sphere.to_local, 0.25, 21, _CLOUD),
+                partial(_blobs, cylinder.to_local, 0.25, 22, _CLOUD),
+            ]
         shown = [Body(sphere, paints[0]), Body(cylinder, paints[1])]
     cloths: dict[str, Field] = {"high": _weave, "no": _plain(0.60, 0.62, 0.65)}
-    cloths["low"] = _blobs(lambda p: p, 0.45, 23, _DUSK)
+    cloths["low"] = partial(_blobs, lambda p: p, 0.45, 23, _DUSK)
     lights = rc.area_light(middle, np.array([0.42, 0.0, 0.3]), np.array([0.1, 0.3, -0.35]), 9)
     return rc.World((*shown, Body(wall, cloths[style])), lights, spread=0.06)

@@ -130,7 +130,7 @@ def extrusion(outlines: Sequence[Array], height: float) -> Shape:
         end = np.where(np.roll(smooth, -1), unit(normal + behind), normal)
         arc = np.concatenate(([0.0], np.cumsum(np.linalg.norm(edge, axis=1))))
         foot, along = np.concatenate((outline, after)), np.concatenate((arc[:-1], arc[1:]))
-        points = np.concatenate([_at_height(foot, z) for z in (0.0, height)])
+        points = np.concatenate([np.column_stack((foot, np.full(len(foot), z))) for z in (0.0, height)])
         chart = np.concatenate([np.column_stack((along, np.full(len(along), z), 0 * along)) for z in (0.0, height)])
         a, b, c, d = np.arange(4 * len(outline)).reshape(4, -1)
         faces = np.concatenate((np.stack((a, b, c), 1), np.stack((b, d, c), 1)))
@@ -138,16 +138,12 @@ def extrusion(outlines: Sequence[Array], height: float) -> Shape:
     flat = np.concatenate(outlines)
     ends = np.cumsum([len(o) for o in outlines]).astype(np.uint32)
     faces = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), ends).reshape(-1, 3).astype(np.intp)
+    base = np.column_stack((flat, np.zeros(len(flat))))
     for z in (0.0, height):
-        points = _at_height(flat, z)
+        points = np.column_stack((flat, np.full(len(flat), z)))
         normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-        parts.append(Shape(points, faces, normals, _at_height(flat, 0.0), points))
+        parts.append(Shape(points, faces, normals, base, points))
     return merge(parts)
-
-
-def _at_height(flat: Array, z: float) -> Array:
-    """Return the points (K, 3) at height ``z`` over points (K, 2)."""
-    return np.column_stack((flat, np.full(len(flat), z)))
 
 
 def tube(path: Array, radius: Array | float, segments: int = 20) -> Shape:
@@ -226,11 +222,11 @@ def ellipsoid(size: Array, power: Array, steps: int = 48) -> Shape:
     def signed(value: Array, exponent: float) -> Array:
         return np.sign(value) * np.abs(value) ** exponent
 
-    def ball(e: Array) -> Array:
+    balls = []
+    for e in (power, 2 - power):  # of the points, and of their normals
         across, top = signed(np.cos(phi), e[0]), signed(np.sin(phi), e[0])
-        return grid(across * signed(np.cos(theta), e[1]), across * signed(np.sin(theta), e[1]), top)
-
-    return surface(ball(power) * size, unit(ball(2 - power) / size))
+        balls.append(grid(across * signed(np.cos(theta), e[1]), across * signed(np.sin(theta), e[1]), top))
+    return surface(balls[0] * size, unit(balls[1] / size))
 
 
 def cylinder(rng: np.random.Generator) -> Shape:
