@@ -169,10 +169,13 @@ class DepthSample:
             "rgb": str(self.rgb.dtype).removeprefix("torch."),
             "unit": asdict(self.unit),
         }
-        arrays: dict[str, Any] = {
-            "rgb": _pack(self.rgb.permute(1, 2, 0).cpu().numpy()),
-            "depth_lr": self.depth_lr[0].cpu().numpy(),
-        }
+        rgb = stored = self.rgb.permute(1, 2, 0).cpu().numpy()
+        for kind, largest in _BITS.items():  # as integers where these give back the same values
+            packed = np.rint(rgb * largest).astype(kind)
+            if np.array_equal(packed.astype(rgb.dtype) / rgb.dtype.type(largest), rgb):
+                stored = packed
+                break
+        arrays: dict[str, Any] = {"rgb": stored, "depth_lr": self.depth_lr[0].cpu().numpy()}
         if self.depth is not None:
             arrays["depth"] = self.depth[0].cpu().numpy()
         arrays |= {f"{_REGION}{name}": region[0].cpu().numpy() for name, region in self.regions.items()}
@@ -185,11 +188,13 @@ class DepthSample:
         try:
             arrays = read_arrays(path)
             about: dict[str, Any] = parse_json(str(arrays["about"]))
-            limits = about["unit"]["limits"]
+            limits, rgb, dtype = about["unit"]["limits"], arrays["rgb"], np.dtype(about["rgb"])
+            if (largest := _BITS.get(str(rgb.dtype))) is not None:
+                rgb = rgb.astype(dtype) / dtype.type(largest)
             return cls(
                 str(about["dataset"]),
                 str(about["name"]),
-                torch.from_numpy(_unpack(arrays["rgb"], about["rgb"])).permute(2, 0, 1).contiguous(),
+                torch.from_numpy(rgb).permute(2, 0, 1).contiguous(),
                 torch.from_numpy(arrays["depth_lr"])[None],
                 Camera(**about["camera"]),
                 Camera(**about["camera_lr"]),
@@ -223,21 +228,6 @@ class DepthSample:
 
 _REGION = "region_"  # beginning of the names of arrays that are regions
 _BITS = {"uint8": 255, "uint16": 65535}  # the largest values of the integers that photos are stored as
-
-
-def _pack(rgb: np.ndarray) -> np.ndarray:
-    """Return values in [0, 1] as integers where these give back the same values, else unchanged."""
-    for kind, largest in _BITS.items():
-        packed = np.rint(rgb * largest).astype(kind)
-        if np.array_equal(_unpack(packed, str(rgb.dtype)), rgb):
-            return packed
-    return rgb
-
-
-def _unpack(stored: np.ndarray, dtype: str) -> np.ndarray:
-    """Return the values that :func:`_pack` was given."""
-    largest = _BITS.get(str(stored.dtype))
-    return stored if largest is None else stored.astype(dtype) / np.dtype(dtype).type(largest)
 
 
 def _reduced_size(size: tuple[int, int], ratio: float, size_lr: Sequence[int]) -> tuple[int, int]:

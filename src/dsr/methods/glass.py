@@ -78,12 +78,11 @@ def probability_of_glass(rgb: Tensor, inverse: Tensor) -> Tensor:
     """
     height, width = rgb.shape[-2:]
     inverse = inverse.to(rgb.device, torch.float32)
-    size = _grid_size(height, width, GRID)
-    known = inverse.isfinite()
-    if is_scattered(known) or not bool(_on_grid(inverse, size)[1].gt(0.5).any()):
+    if is_scattered(inverse.isfinite()):
         return torch.zeros(1, height, width, device=rgb.device)
-    near = _blur(_holes(known, size, WIDE), _HOLES[-1])[0] > _EVIDENCE
-    found = torch.zeros(size, device=rgb.device)
+    _, weight, holes = _on_grid(inverse, (height, width), GRID, WIDE)
+    near = (_blur(holes, _HOLES[-1])[0] > _EVIDENCE) & weight.gt(0.5).any()  # nowhere if nothing is known
+    found = torch.zeros(near.shape, device=rgb.device)
     if bool(near.any()):
         finder = glass_finder(rgb.device)
         features = glass_features(rgb, inverse)[:, near].T
@@ -102,11 +101,9 @@ def glass_features(rgb: Tensor, inverse: Tensor, grid: int = GRID, wide: float |
 
     ``grid`` are the pixels of its longer side; holes wider than ``wide`` of them do not count, except in the training.
     """
-    size = _grid_size(rgb.shape[-2], rgb.shape[-1], grid)
+    logs, weight, holes = _on_grid(inverse.float(), (rgb.shape[-2], rgb.shape[-1]), grid, wide)
+    size, known = weight.shape[-2:], weight > 0.5
     photo = functional.interpolate(rgb[None].float(), size, mode="bilinear", antialias=True, align_corners=False)[0]
-    logs, weight = _on_grid(inverse.float(), size)
-    known = weight > 0.5
-    holes = _holes(inverse.isfinite(), size, wide)
     steps = {}  # by how much the known values of windows differ, (1, g, g'); much less than 0 where there is none
     for reach in {*_NEAR, _AMID_REACH}:
         highest, lowest = (window_maxima((sign * logs).masked_fill(~known, -1e3), reach) for sign in (1, -1))
@@ -145,33 +142,25 @@ def glass_features(rgb: Tensor, inverse: Tensor, grid: int = GRID, wide: float |
     return torch.cat(found)
 
 
-def _on_grid(inverse: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Return logarithms of inverse depth on the grid and which part of each pixel is known, (1, g, g') each."""
+def _on_grid(inverse: Tensor, photo: tuple[int, int], longer: int, wide: float | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Return logarithms of inverse depth on the grid, which part of each pixel is known, and which is a hole.
+
+    All are (1, g, g'). The longer side of the photo's grid is given; thin holes, and those wider than ``wide``, do not
+    count if that is given.
+    """
+    size = tuple(max(16, round(length * longer / max(photo))) for length in photo)
+    mode = "area" if inverse.shape[-1] > size[1] else "nearest-exact"
     known = inverse.isfinite()
-    values = torch.where(known, inverse, 1).clamp(min=1e-6).log()[None]
-    weight = known.to(values)[None]
-    logs, weight = (functional.interpolate(each, size, mode=_mode(inverse, size))[0] for each in (values, weight))
-    return torch.where(weight > 0, logs / weight.clamp(min=1e-3), 0), weight
-
-
-def _grid_size(height: int, width: int, longer: int) -> tuple[int, int]:
-    """Return the size of the grid of a photo, whose longer side is given."""
-    longest = max(height, width)
-    return max(16, round(height * longer / longest)), max(16, round(width * longer / longest))
-
-
-def _holes(known: Tensor, size: tuple[int, int], wide: float | None) -> Tensor:
-    """Return the share of holes of each grid pixel, (1, g, g'), without wide and thin ones if ``wide`` is given."""
+    values = torch.where(known, inverse, 1).clamp(min=1e-6).log()
     missing = (~known).float()
     if wide is not None and min(known.shape[-2:]) > 2:
         missing = window_maxima(-window_maxima(-missing, 1), 1)
-    found = functional.interpolate(missing[None], size, mode=_mode(known, size))[0]
-    return found if wide is None else found.masked_fill(wide_holes(found < 0.5, wide), 0)
-
-
-def _mode(values: Tensor, size: tuple[int, int]) -> str:
-    """Return how a map is brought to a size: by means, or by repeating pixels."""
-    return "area" if values.shape[-1] > size[1] else "nearest-exact"
+    logs, weight, holes = (
+        functional.interpolate(each[None], size, mode=mode)[0] for each in (values, known.to(values), missing)
+    )
+    if wide is not None:
+        holes = holes.masked_fill(wide_holes(holes < 0.5, wide), 0)
+    return torch.where(weight > 0, logs / weight.clamp(min=1e-3), 0), weight, holes
 
 
 def _blur(values: Tensor, deviation: float) -> Tensor:

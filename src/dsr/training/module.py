@@ -184,7 +184,14 @@ class SuperResolution(lightning.LightningModule):
     def on_validation_epoch_end(self) -> None:
         """Log the mean scores as ``val/METRIC`` or ``test/METRIC``, to loggers in the units of tables, and pictures."""
         if not self.trainer.sanity_checking:  # of a few scenes
-            self._log_pictures()
+            pictures = self._pictures
+            if self.trainer.world_size > 1:
+                all_devices: list[Any] = [None] * self.trainer.world_size
+                torch.distributed.all_gather_object(all_devices, pictures)
+                pictures = {name: picture for each in all_devices for name, picture in each.items()}
+            for name, picture in sorted(pictures.items()):
+                for logger in self.loggers:
+                    log_picture(logger, name, picture, self.global_step)
             self._log_scores("test" if self.trainer.testing else "val")
         self._pictures, self._bicubic_metrics = {}, []
         for each in self.metrics:
@@ -193,16 +200,6 @@ class SuperResolution(lightning.LightningModule):
     test_step = validation_step
     on_test_epoch_start, on_test_epoch_end = on_validation_epoch_start, on_validation_epoch_end
 
-    def _log_pictures(self) -> None:
-        pictures = self._pictures
-        if self.trainer.world_size > 1:
-            all_devices: list[Any] = [None] * self.trainer.world_size
-            torch.distributed.all_gather_object(all_devices, pictures)
-            pictures = {name: picture for each in all_devices for name, picture in each.items()}
-        for name, picture in sorted(pictures.items()):
-            for logger in self.loggers:
-                log_picture(logger, name, picture, self.global_step)
-
     def _log_scores(self, stage: str) -> None:
         means = self._means(stage, self.metrics)
         if self._bicubic_metrics:
@@ -210,11 +207,14 @@ class SuperResolution(lightning.LightningModule):
         self.validation_scores = means | self.bicubic
         metrics: Any = {name: metric for each in self.metrics for name, metric in each.items()}  # type: ignore[operator]
         self.shown_scores = {kind: in_table_units(metrics, raw) for kind, raw in self.validation_scores.items()}
-        shown = _by_tag(self.shown_scores)
+        tagged, shown = (
+            {f"{kind}/{name}": value for kind, each in scores.items() for name, value in each.items()}
+            for scores in (self.validation_scores, self.shown_scores)
+        )
         if self.trainer.state.fn != TrainerFn.FITTING:
             self.log_dict(shown)
             return
-        self.log_dict(_by_tag(self.validation_scores), logger=False)
+        self.log_dict(tagged, logger=False)
         for logger in self.loggers:  # Lightning would count steps from 0
             logger.log_metrics(shown, self.global_step)
             logger.save()
@@ -270,11 +270,6 @@ class SuperResolution(lightning.LightningModule):
             return optimizer
         schedule = {"scheduler": self._make_scheduler(optimizer), "interval": "step"}
         return {"optimizer": optimizer, "lr_scheduler": schedule}
-
-
-def _by_tag(scores: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
-    """Return the scores of sets by the names that they are logged by."""
-    return {f"{kind}/{name}": value for kind, each in scores.items() for name, value in each.items()}
 
 
 def _node_of(make: Any) -> dict[str, Any] | None:

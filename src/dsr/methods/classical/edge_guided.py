@@ -304,7 +304,7 @@ def find_recurring(lr: Tensor, scale: int, step: float) -> Tensor:
     first, second = patches.sum(dim=(2, 3)).unbind(1)
     enough = min(2 * scale, PATCH - 3)
     kept = (first > enough) & (second > enough) & ((first - second).abs() < 0.8 * PATCH)
-    return deduplicate(orient(patches[kept]))
+    return _distinct(patches[kept])
 
 
 def thin(mask: Tensor) -> Tensor:
@@ -346,15 +346,10 @@ def extract_patches(mask: Tensor, places: Tensor) -> Tensor:
     return mask[places[:, 0, None, None] + offsets[:, None], places[:, 1, None, None] + offsets]
 
 
-def orient(patches: Tensor) -> Tensor:
-    """Return patches, (N, ..., PATCH, PATCH), under the 8 dihedral transforms, (8 N, ..., PATCH, PATCH)."""
+def _distinct(patches: Tensor) -> Tensor:
+    """Return pairs of patches, (N, 2, PATCH, PATCH) bool, under the 8 dihedral transforms, sorted, each once."""
     quarters = [patches.rot90(k, (-2, -1)) for k in range(4)]
-    return torch.cat(quarters + [each.mT for each in quarters])
-
-
-def deduplicate(patches: Tensor) -> Tensor:
-    """Return the pairs of patches, (N, 2, PATCH, PATCH) bool, without repetitions, sorted."""
-    bits = patches.flatten(1).long()
+    bits = torch.cat(quarters + [each.mT for each in quarters]).flatten(1).long()
     place = torch.arange(_BITS, device=bits.device)
     words = (functional.pad(bits, (0, -bits.shape[1] % _BITS)).unflatten(1, (-1, _BITS)) << place).sum(dim=2)
     words = torch.unique(words, dim=0)

@@ -61,8 +61,11 @@ class FastGlobalSmoother(GuidedMethod):
 
 def smooth(guide: Tensor, maps: Tensor, strength: float, sigma_colour: float, iterations: int) -> Tensor:
     """Smooth maps, (N, H, W), where the guide, (3, H, W), is smooth; ``strength`` is lambda in squared pixels."""
-    along_rows = _weights(guide.mT, sigma_colour)  # (W - 1, H), the axis that is solved along comes first
-    along_columns = _weights(guide, sigma_colour)  # (H - 1, W)
+    # exp(-|I_p - I_q| / sigma) of neighbours, (W - 1, H) and (H - 1, W): the axis that is solved along comes first
+    along_rows, along_columns = (
+        torch.exp((each[:, 1:] - each[:, :-1]).square().sum(dim=0).sqrt() / -sigma_colour).contiguous()
+        for each in (guide.mT, guide)
+    )
     for t in range(1, iterations + 1):
         lambda_t = 1.5 * 4.0 ** (iterations - t) / (4.0**iterations - 1) * strength
         maps = solve_lines(lambda_t * along_rows, maps.permute(2, 0, 1)).permute(1, 2, 0)
@@ -90,8 +93,3 @@ def solve_lines(weights: Tensor, right: Tensor) -> Tensor:
     for k in range(length - 2, -1, -1):
         solution[k] -= upper[k] * solution[k + 1]
     return solution
-
-
-def _weights(guide: Tensor, sigma_colour: float) -> Tensor:
-    """Return exp(-|I_p - I_q| / sigma) of each pixel and the one below it, (H - 1, W)."""
-    return torch.exp((guide[:, 1:] - guide[:, :-1]).square().sum(dim=0).sqrt() / -sigma_colour).contiguous()

@@ -150,7 +150,7 @@ class ShadingSolver:
         if anew or not found:
             found.append(fuse(problem.rgb, shading, problem.boundary_weight, problem.inside))
         tried = [(fit_albedo(problem.rgb, shading, regions), regions) for regions in found]
-        energies = [self._shading_energy(albedo, shading) + self._boundaries(regions) for albedo, regions in tried]
+        energies = [sum(self._energies(albedo, shading, regions)) for albedo, regions in tried]
         self.albedo, self.regions = tried[energies.index(min(energies))]
 
     def update_lighting(self) -> None:
@@ -195,11 +195,12 @@ class ShadingSolver:
         normals, size = compute_surface(theta, self.problem.rays)
         miss = self._lr - self._block_means(self.z)
         area = theta[:, 2:].abs() * size
+        shading, boundaries = self._energies(self.albedo, compute_shading(normals, self.lighting), self.regions)
         return {
-            "shading": self._shading_energy(self.albedo, compute_shading(normals, self.lighting)),
+            "shading": shading,
             "data": 0.5 * self.problem.data_weight * float(miss.square().sum()),
             "area": self.problem.area_weight * float((self._weight * area).sum()),
-            "boundaries": 0.0 if self.regions is None else self._boundaries(self.regions),
+            "boundaries": boundaries,
         }
 
     def pixel_energy(self, theta: Tensor, target: Tensor) -> Tensor:
@@ -218,8 +219,10 @@ class ShadingSolver:
         directed = torch.einsum("bck,bkhw->bchw", light, n)
         residual = self.albedo * (directed + self.lighting[..., 3, None, None]) - self.problem.rgb
         by_m = (light[..., None, None] - directed[:, :, None] * n[:, None]) * (self.albedo / size)[:, :, None]
-        slopes = _chain_to_theta(by_m, rays)  # the derivatives of the residual, (B, C, 3, H, W)
-        stretch = _chain_to_theta(n, rays)  # those of |m|
+        slopes, stretch = (  # derivatives by theta of the residual, (B, C, 3, H, W), and of |m|, (B, 3, H, W)
+            torch.stack((along_u - rays[0, 0] * ahead, along_v - rays[0, 1] * ahead, -ahead), dim=-3)
+            for along_u, along_v, ahead in (by_m.unbind(dim=-3), n.unbind(dim=-3))
+        )
 
         depth = theta[:, 2:]
         gradient = (residual[:, :, None] * slopes).sum(dim=1) + area_weight * depth.abs() * stretch
@@ -243,17 +246,11 @@ class ShadingSolver:
     def _block_means_adjoint(self, lr: Tensor) -> Tensor:
         return repeat_blocks(lr, self.scale) / self.scale**2
 
-    def _shading_energy(self, albedo: Tensor, shading: Tensor) -> float:
-        return 0.5 * float((self._weight * (albedo * shading - self.problem.rgb).square()).sum())
-
-    def _boundaries(self, regions: Regions) -> float:
-        return self.problem.boundary_weight * boundary_length(regions, self.problem.inside)
-
-
-def _chain_to_theta(by_m: Tensor, rays: Tensor) -> Tensor:
-    """Convert derivatives by m to derivatives by theta, (..., 3, H, W)."""
-    along_u, along_v, ahead = by_m.unbind(dim=-3)
-    return torch.stack((along_u - rays[0, 0] * ahead, along_v - rays[0, 1] * ahead, -ahead), dim=-3)
+    def _energies(self, albedo: Tensor, shading: Tensor, regions: Regions | None) -> tuple[float, float]:
+        """Return the terms of E for the shading and for the albedo's boundaries, 0 without regions."""
+        shaded = 0.5 * float((self._weight * (albedo * shading - self.problem.rgb).square()).sum())
+        length = 0 if regions is None else boundary_length(regions, self.problem.inside)
+        return shaded, self.problem.boundary_weight * length
 
 
 def _solve(gradient: Tensor, hessian: Tensor, damping: Tensor) -> Tensor:

@@ -125,7 +125,11 @@ class TotalGeneralisedVariation(Method):
         if scale > 1 and not bool(valid.all()):
             start = self.minimise(box_mean(rgb, scale), lr, 1).values
         u = upsample_linear_border(start, scale)
-        v = _slopes(u)
+        v = gradient(u)[:, :, 0]  # in the last column and row as in the one before
+        if u.shape[-1] > 1:
+            v[:, 0, :, -1] = v[:, 0, :, -2]
+        if u.shape[-2] > 1:
+            v[:, 1, -1] = v[:, 1, -2]
         p, q = torch.zeros_like(v)[:, :, None], torch.zeros_like(gradient(v))
         g = self.diffusion_tensors(rgb)
         step_u, step_v, step_p, step_q = self._step_sizes(g)
@@ -146,8 +150,10 @@ class TotalGeneralisedVariation(Method):
             prox_v = v + step_v * (gp[:, :, 0] + divergence(q))
             ahead_u, ahead_v = 2 * prox_u - u, 2 * prox_v - v
             bent = g.times(_zero_border(gradient(ahead_u) - ahead_v[:, :, None]))
-            prox_p = _project_ball(p + step_p * bent, self.first)
-            prox_q = _project_ball(q + step_q * gradient(ahead_v), self.second)
+            prox_p, prox_q = (  # each pixel's vector or matrix, projected onto the ball of a radius
+                each / (each.square().sum(dim=(1, 2), keepdim=True).sqrt() / radius).clamp(min=1)
+                for each, radius in ((p + step_p * bent, self.first), (q + step_q * gradient(ahead_v), self.second))
+            )
             u, v = u.lerp(prox_u, _RELAXATION), v.lerp(prox_v, _RELAXATION)
             p, q = p.lerp(prox_p, _RELAXATION), q.lerp(prox_q, _RELAXATION)
             since = (done - 1) % _CHECK_EVERY + 1
@@ -216,24 +222,8 @@ def sum_adjacent(p: Tensor, sign: int = 1) -> Tensor:
     return total
 
 
-def _slopes(u: Tensor) -> Tensor:
-    """Return the gradient of (B, 1, H, W) maps, (B, 2, H, W); the last column and row repeat the one before."""
-    v = gradient(u)[:, :, 0]
-    if u.shape[-1] > 1:
-        v[:, 0, :, -1] = v[:, 0, :, -2]
-    if u.shape[-2] > 1:
-        v[:, 1, -1] = v[:, 1, -2]
-    return v
-
-
 def _zero_border(p: Tensor) -> Tensor:
     """Set the entries of (B, 2, C, H, W) for differences beyond the border to 0, in place."""
     p[:, 0, ..., -1] = 0
     p[:, 1, ..., -1, :] = 0
     return p
-
-
-def _project_ball(p: Tensor, radius: float) -> Tensor:
-    """Project each pixel's vector or matrix of (B, 2, C, H, W) onto the ball of a radius."""
-    lengths = p.square().sum(dim=(1, 2), keepdim=True).sqrt()
-    return p / (lengths / radius).clamp(min=1)

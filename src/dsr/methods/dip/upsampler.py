@@ -154,7 +154,11 @@ class DeepImagePrior(Method):
                 callbacks=callbacks, logger=logger, limit_val_batches=1 if self.validate_every else 0,
                 enable_checkpointing=False,
             )  # fmt: skip
-            fit(trainer, module, _numbers(self.steps), val_dataloaders=_numbers(1))
+            numbers: Any = (range(self.steps), range(1))  # of the steps, and of the scenes of a validation
+            steps, scenes = (  # loaders that do not use the global random generator
+                DataLoader(each, batch_size=None, generator=torch.Generator()) for each in numbers
+            )
+            fit(trainer, module, steps, val_dataloaders=scenes)
         return module.best[0].to(sample.depth_lr)
 
 
@@ -178,6 +182,8 @@ class PriorOptimisation(lightning.LightningModule):
         self.near, self.far = max(low - margin, 0.5 * low), low + self.range + margin
 
         height, width = self.grey.shape[-2:]
+        sides = min(self.depth_lr.shape[-2:]), min(height, width)
+        self.levels_lr, self.levels = (1 + (side >= 6) + (side >= 12) for side in sides)  # of Laplacian pyramids
         self.border = min(options.border, min(height, width) - 1)  # reflection needs as many pixels
         seed = scene_generator(options.seed, sample.dataset, sample.scene, sample.scale, "prior").initial_seed()
         self.generator = torch.Generator(device).manual_seed(seed)
@@ -224,8 +230,7 @@ class PriorOptimisation(lightning.LightningModule):
         if options.data_loss == "mse":
             data = mse(depth_lr / self.range, self.target, complete=complete).squeeze()
         else:
-            levels = _count_levels(depth_lr)
-            data = lap1(depth_lr / self.range, self.target, levels=levels, complete=complete).squeeze()
+            data = lap1(depth_lr / self.range, self.target, levels=self.levels_lr, complete=complete).squeeze()
         terms = {f"data_{options.data_loss}": data}
         loss = DATA_WEIGHTS[options.data_loss] * data
         if self.w:
@@ -236,7 +241,7 @@ class PriorOptimisation(lightning.LightningModule):
             terms[options.visual] = visual if surfaces.complete else visual.nansum()  # there may be none between holes
             loss = loss + self.w * terms[options.visual]
         if options.w_intensity:
-            terms["intensity"] = lap1(intensity, self.grey, levels=_count_levels(intensity), complete=True).squeeze()
+            terms["intensity"] = lap1(intensity, self.grey, levels=self.levels, complete=True).squeeze()
             loss = loss + options.w_intensity * terms["intensity"]
         return {"loss": loss, **terms}
 
@@ -277,18 +282,6 @@ class PriorOptimisation(lightning.LightningModule):
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Return Adam."""
         return torch.optim.Adam(self.net.parameters(), self.options.learning_rate, fused=True)
-
-
-def _count_levels(x: Tensor) -> int:
-    """Return the number of levels of a Laplacian pyramid, up to 3, that a map has room for."""
-    side = min(x.shape[-2:])
-    return 1 + (side >= 6) + (side >= 12)
-
-
-def _numbers(count: int) -> Any:
-    """Return a loader of numbers, one for each step, that does not use the global random generator."""
-    numbers: Any = range(count)
-    return DataLoader(numbers, batch_size=None, generator=torch.Generator())
 
 
 class SkipNet(nn.Module):

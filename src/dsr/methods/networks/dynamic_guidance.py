@@ -85,11 +85,6 @@ class Stage(nn.Module):
         self.mixing = nn.Parameter(torch.eye(filters) + _SHARED)
         self.fidelity = nn.Parameter(torch.tensor(_FIDELITY))
 
-    def filters(self, like: Tensor) -> Tensor:
-        """Return the k_l in the dtype of ``like``, (L, 1, size, size)."""
-        unit = functional.normalize(self.analysis.to(like), dim=1)
-        return torch.einsum("lb,bij->lij", unit, polynomial_filters(self.size)[3:].to(like))[:, None]
-
     def weights(self, rgb: Tensor) -> Tensor:
         """Return the w_l of photos (B, 3, H, W), (B, L, H - size + 1, W - size + 1)."""
         filters = torch.einsum("lcb,bij->lcij", self.guidance.to(rgb), polynomial_filters(self.size)[1:].to(rgb))
@@ -102,7 +97,9 @@ class Stage(nn.Module):
         x = x - self.fidelity.to(x) * upsample_linear_border(box_mean(x, scale) - lr, scale)
         if min(x.shape[-2:]) < self.size:
             return x
-        filters, heights = self.filters(x), self.heights.to(x) / len(self.heights)  # for a step size of 1
+        unit = functional.normalize(self.analysis.to(x), dim=1)
+        filters = torch.einsum("lb,bij->lij", unit, polynomial_filters(self.size)[3:].to(x))[:, None]  # the k_l
+        heights = self.heights.to(x) / len(self.heights)  # for a step size of 1
         forces = self.weights(rgb) * influence(functional.conv2d(x, filters), heights)
         return x - functional.conv_transpose2d(forces, filters)
 

@@ -69,7 +69,11 @@ class Facets(NormalisedNetwork):
         around = stencil(values)
         dtype = self.photo.weight.dtype
         pyramid = look(self.photo, self.down, photo_input(rgb, mean).to(dtype))
-        x = self.trunk(functional.relu(pyramid[-1] + self.coarse(_lr_input(around).to(dtype))))
+        # (B, 10, h, w): compressed differences, so that small ones count, linear ones, and directions
+        differences = torch.cat((around.value - around.mean, around.slopes[:, :, 1], around.bend), dim=1).float()
+        turns = around.turns.float() / around.bend.float().clamp(min=torch.finfo(torch.float32).tiny)
+        lr_input = torch.cat((torch.asinh(differences / _FAINT) / 3, differences / _STRONG, turns), dim=1)
+        x = self.trunk(functional.relu(pyramid[-1] + self.coarse(lr_input.to(dtype))))
         planes = self._propose_planes(self.planes(x), around)
         return mix_planes(planes, self.choice(rise(self.up, self.join, x, pyramid)), self.scale)[0]
 
@@ -85,13 +89,6 @@ class Facets(NormalisedNetwork):
         base = torch.cat((around.value, slopes), dim=1)[:, None]
         planes = base + moves.view(batch, self.facets, 3, height, width) * around.bend[:, None]
         return planes if self.slopes else torch.cat((planes[:, :, :1], torch.zeros_like(planes[:, :, 1:])), dim=2)
-
-
-def _lr_input(around: Stencil) -> Tensor:
-    """Return (B, 10, h, w): compressed differences, so that small ones count, linear ones, and directions."""
-    differences = torch.cat((around.value - around.mean, around.slopes[:, :, 1], around.bend), dim=1).float()
-    turns = around.turns.float() / around.bend.float().clamp(min=torch.finfo(torch.float32).tiny)
-    return torch.cat((torch.asinh(differences / _FAINT) / 3, differences / _STRONG, turns), dim=1)
 
 
 def make_pyramid(
@@ -183,7 +180,11 @@ class MixedResidual(nn.Module):
         batch = 1 if exporting() else len(x)  # a graph has to know the shapes of its weights
         width, square = self.width, (batch, self.width, 3, 3, self.width)
         gain, shift = (1 + gains.float()).reshape(batch, width), shifts.reshape(batch, width).float()
-        mixed = torch.lerp(_in_a_row(first), _in_a_row(second), shares.reshape(batch, 1).float())
+        own, other = (  # weights of the sets, (n,) in float32, with the channels of an input pixel side by side
+            [(each.permute(0, 2, 3, 1) if each.dim() > 1 else each).flatten() for each in way.parameters()]
+            for way in (first, second)
+        )
+        mixed = torch.lerp(torch.cat(own).float(), torch.cat(other).float(), shares.reshape(batch, 1).float())
         weight, bias, last, last_bias = mixed.split((9 * width**2, width) * 2, dim=1)
         weight = weight.view(square) * gain[..., None, None, None]
         bias = torch.addcmul(shift, bias, gain)
@@ -192,12 +193,6 @@ class MixedResidual(nn.Module):
         images = x.reshape(1, -1, *x.shape[-2:]) if batch > 1 else x  # each image is a group of channels
         hidden = functional.relu(functional.conv2d(images, weight, bias, padding=1, groups=batch), inplace=True)
         return functional.conv2d(hidden, last, last_bias, padding=1, groups=batch).add_(images).view(x.shape)
-
-
-def _in_a_row(block: Residual) -> Tensor:
-    """Return the weights of a block, (n,) in float32, with the channels of an input pixel side by side."""
-    parameters = (each.permute(0, 2, 3, 1) if each.dim() > 1 else each for each in block.parameters())
-    return torch.cat([each.flatten() for each in parameters]).float()
 
 
 class CoarseUNet(nn.Module):

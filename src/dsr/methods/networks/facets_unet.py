@@ -177,7 +177,13 @@ class FacetsUNet(DisparityNetwork):
         """
         expect_rgb_size(rgb, disparity, 1 if self.scale < 4 and rgb.shape[-1] == disparity.shape[-1] else self.scale)
         known = disparity.isfinite()
-        unit = _median(disparity, known)
+        # the unit is the lower median of a map's known values, (B, 1, 1, 1)
+        if exporting():
+            ordered = torch.where(known, disparity, torch.inf).flatten(1).sort(dim=1).values
+            middle = (known.flatten(1).sum(dim=1, keepdim=True) - 1).clamp(min=0) // 2
+            unit = ordered.gather(1, middle)[..., None, None]
+        else:
+            unit = disparity.masked_fill(~known, torch.nan).flatten(1).nanmedian(dim=1).values.view(-1, 1, 1, 1)
         values = (inpaint(disparity, rgb) if filled is None else filled) / unit
         batch = disparity.shape[0]
         if hints is None:
@@ -231,7 +237,7 @@ class FacetsUNet(DisparityNetwork):
             if number == _BEFORE:
                 x = x + self.wide(x)
             x = block(x, shares[:, number], *modulate(kind).chunk(2, dim=1))
-        planes = self._blend_planes(self._propose_planes(self.planes(x), around), self.blend(x))
+        planes = self._propose_planes(self.planes(x), self.blend(x), around)
         bits = []
         for number, (window, (rows, inner)) in enumerate(zip(windows, bands, strict=True), 1):
             high = rise(self.up, self.join, x[..., rows, :], kept or look(self.photo, self.down, window))
@@ -264,8 +270,11 @@ class FacetsUNet(DisparityNetwork):
         errors, gate = others.float().split((2, 1), dim=1)
         return mixed, errors - 5, torch.sigmoid(gate + _CLOSED)
 
-    def _propose_planes(self, output: Tensor, around: Stencil) -> Tensor:
-        """Return the planes of each low-resolution pixel, (B, facets, 3, h, w): value at its centre and slopes."""
+    def _propose_planes(self, output: Tensor, blend: Tensor, around: Stencil) -> Tensor:
+        """Return the planes of each low-resolution pixel, averaged with those around them, (B, facets, 3, h, w).
+
+        They are the value at its centre and the slopes, and ``blend`` the logits of the averages' weights.
+        """
         output = output.to(torch.promote_types(around.value.dtype, torch.float32))
         output = output.unflatten(1, (self.facets, -1))
         values, slopes, moves = output.split((1 + _LEVELS, 2 * (3 + _LEVELS), 3), dim=2)
@@ -274,11 +283,8 @@ class FacetsUNet(DisparityNetwork):
         slopes = _favour(slopes.unflatten(2, (2, -1)), 1).softmax(dim=3)  # (B, facets, 2, 3 + levels, h, w)
         central = around.slopes[1:, :, :, 1].permute(1, 2, 0, 3, 4)
         slope = (slopes * torch.cat((around.slopes[0], central), dim=2)[:, None]).sum(dim=3)
-        return torch.cat((value[:, :, None], slope), dim=2) + moves * around.bend[0][:, None]
-
-    def _blend_planes(self, planes: Tensor, logits: Tensor) -> Tensor:
-        """Return planes averaged with those around them, (B, facets, 3, h, w)."""
-        logits = logits.to(planes.dtype).unflatten(1, (self.facets, len(_REACHES), NEIGHBOURS))
+        planes = torch.cat((value[:, :, None], slope), dim=2) + moves * around.bend[0][:, None]
+        logits = blend.to(planes.dtype).unflatten(1, (self.facets, len(_REACHES), NEIGHBOURS))
         before, own, after = logits.split((NEIGHBOURS // 2, 1, NEIGHBOURS // 2), dim=3)
         weights = torch.cat((before, own + _OWN, after), dim=3).softmax(dim=3)
         for step, reach in enumerate(_REACHES):
@@ -361,12 +367,3 @@ def _roughness(bend: Tensor, weight: Tensor) -> Tensor:
     quantiles = torch.where(count > 0, quantiles, torch.nan)
     quantiles = quantiles.unflatten(0, (1 + _LEVELS, -1)).transpose(0, 1).flatten(1)  # (B, levels * quantiles)
     return (torch.log10(quantiles.nan_to_num(0) + 1e-6) + 4) / 2
-
-
-def _median(values: Tensor, known: Tensor) -> Tensor:
-    """Return the lower median of the known values of maps, (B, 1, h, w) to (B, 1, 1, 1)."""
-    if not exporting():
-        return values.masked_fill(~known, torch.nan).flatten(1).nanmedian(dim=1).values.view(-1, 1, 1, 1)
-    ordered = torch.where(known, values, torch.inf).flatten(1).sort(dim=1).values
-    middle = (known.flatten(1).sum(dim=1, keepdim=True) - 1).clamp(min=0) // 2
-    return ordered.gather(1, middle)[..., None, None]

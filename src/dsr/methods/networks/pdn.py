@@ -191,8 +191,15 @@ class PrimalDualNetwork(NormalisedNetwork):
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
         """Return normalised disparity (B, 1, H, W) for (B, 3, H, W) and (B, 1, h, w); see the base class."""
-        hr = upsample_linear_border(values, self.scale)
-        inputs, bend = self._inputs(rgb, values, hr)
+        hr, around = upsample_linear_border(values, self.scale), stencil(values)
+        slopes_lr = torch.cat((around.slopes[:, :, 1], around.value - around.mean), dim=1)
+        size = tuple(hr.shape[-2:])
+        bend = functional.interpolate(around.bend.float(), size=size, mode="bilinear")
+        slopes = functional.interpolate(slopes_lr.float(), size=size, mode="bilinear")
+        detail = (hr - upsample_linear_border(around.mean, self.scale)).float()
+        relative = detail / bend.clamp(min=torch.finfo(torch.float32).tiny)
+        depth = torch.asinh(torch.cat((slopes, detail, bend), dim=1) / _FAINT) / 3  # enlarges small values
+        inputs = torch.cat((rgb.float() - 0.5, depth, relative.clamp(-2, 2)), dim=1)  # (B, 9, H, W)
         output = self.head(self.trunk(inputs.to(self.head.weight.dtype)))
         with torch.autocast(rgb.device.type, enabled=False):
             output = output.to(torch.float32 if output.dtype == torch.bfloat16 else output.dtype)
@@ -203,15 +210,3 @@ class PrimalDualNetwork(NormalisedNetwork):
             first = extend_linearly(hr, 2 * r) + functional.pad(residual, (2 * r,) * 4, mode="replicate")
             moved = self.stage(first[..., r:-r, :], weights)
             return hr + residual + moved.to(hr.dtype)
-
-    def _inputs(self, rgb: Tensor, values: Tensor, hr: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the convolutions' input, (B, 9, H, W), whose small values are enlarged, and the bend."""
-        around = stencil(values)
-        slopes_lr = torch.cat((around.slopes[:, :, 1], around.value - around.mean), dim=1)
-        size = tuple(hr.shape[-2:])
-        bend = functional.interpolate(around.bend.float(), size=size, mode="bilinear")
-        slopes = functional.interpolate(slopes_lr.float(), size=size, mode="bilinear")
-        detail = (hr - upsample_linear_border(around.mean, self.scale)).float()
-        relative = detail / bend.clamp(min=torch.finfo(torch.float32).tiny)
-        depth = torch.asinh(torch.cat((slopes, detail, bend), dim=1) / _FAINT) / 3
-        return torch.cat((rgb.float() - 0.5, depth, relative.clamp(-2, 2)), dim=1), bend

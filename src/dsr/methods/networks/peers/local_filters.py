@@ -49,9 +49,14 @@ class SVLRM(PeerNetwork):
 
         The authors' training takes the last pixel of each block for its middle, so the network undoes such a shift.
         """
-        shift, (height, width) = (self.scale - 1) / 2, values_lr.shape[-2:]
-        down = _cubic_interpolation(height, size[0], shift).to(values_lr)
-        across = _cubic_interpolation(width, size[1], shift).to(values_lr)
+        shift, matrices = (self.scale - 1) / 2, []
+        for old, new in zip(values_lr.shape[-2:], size, strict=True):
+            place = (torch.arange(new, dtype=torch.float64) + 0.5 + shift) * (old / new) - 0.5
+            index = place.floor().long()[:, None] + torch.arange(-1, 3)
+            weight = cubic_kernel((place[:, None] - index).abs(), _CUBIC)
+            matrix = torch.zeros(new, old, dtype=torch.float64)
+            matrices.append(matrix.scatter_add_(1, index.clamp(0, old - 1), weight).to(values_lr))
+        down, across = matrices
         return down @ values_lr @ across.T
 
     def forward(self, rgb: Tensor, values: Tensor) -> Tensor:
@@ -60,14 +65,6 @@ class SVLRM(PeerNetwork):
         x = functional.leaky_relu(self.first_layer(torch.cat((values, luma), dim=1)), _SLOPE)
         gain, offset = self.final_layer(self.feature_block(x)).split(1, dim=1)
         return gain * luma + offset
-
-
-def _cubic_interpolation(old: int, new: int, shift: float) -> Tensor:
-    """Return the matrix (new, old) that interpolates at positions further on by ``shift`` new pixels."""
-    place = (torch.arange(new, dtype=torch.float64) + 0.5 + shift) * (old / new) - 0.5
-    index = place.floor().long()[:, None] + torch.arange(-1, 3)
-    weight = cubic_kernel((place[:, None] - index).abs(), _CUBIC)
-    return torch.zeros(new, old, dtype=torch.float64).scatter_add_(1, index.clamp(0, old - 1), weight)
 
 
 class FDKN(PeerNetwork):
