@@ -93,6 +93,7 @@ class AnyRatio(Method):
             raise ValueError(f"working_size: expected one of {', '.join(map(str, SIZES))}, got {working_size}")
         self.recipe, self._scale, self._fill = recipe, scale, fill
         self._max_hole, self._working_size = max_hole, working_size
+        self._may_reduce = scale is None and finds_noise(recipe)  # whether the working size may be less than the map's
         precision = precision or (fast_precision(device) if recipe.abilities.tolerant else "float32")
         self._run = Run(device=device, precision=precision, seed=seed, downsampling=Downsampling("box"))
         self._methods: dict[int, Method] = {}
@@ -264,11 +265,6 @@ class AnyRatio(Method):
                 set_here = text.partition(":")[0] in self.recipe.settings
                 raise ValueError(text if set_here else f"method={self.recipe.name}: {text}") from error
         return self._methods[factor]
-
-    @property
-    def _may_reduce(self) -> bool:
-        """Whether the working size may be smaller than the map's."""
-        return self._scale is None and finds_noise(self.recipe)
 
     def _small_holes(self, valid: Tensor, camera: Camera) -> Tensor:
         """Return the small holes of a map, (1, h, w), be they to be filled or not: what is beside depends on it."""

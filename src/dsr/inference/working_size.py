@@ -52,15 +52,13 @@ def enlarged_by(values: Tensor) -> int:
     if bool((filled == filled.flatten()[0]).all()):
         return 1
     for block in range(_LARGEST_BLOCK, 1, -1):
-        if _is_repeated(filled[..., :block, :], block) and _is_repeated(filled, block):  # the first rows decide mostly
+        for part in (filled[..., :block, :], filled):  # the first rows decide mostly
+            repeated = part[..., ::block, ::block].repeat_interleave(block, -2).repeat_interleave(block, -1)
+            if not torch.equal(part, repeated[..., : part.shape[-2], : part.shape[-1]]):
+                break
+        else:  # squares of equal values, up to the border
             return block
     return 1
-
-
-def _is_repeated(values: Tensor, block: int) -> bool:
-    """Return whether a map, (..., H, W), consists of squares of equal values, up to the border."""
-    repeated = values[..., ::block, ::block].repeat_interleave(block, -2).repeat_interleave(block, -1)
-    return torch.equal(values, repeated[..., : values.shape[-2], : values.shape[-1]])
 
 
 class _Planes(NamedTuple):

@@ -10,18 +10,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import torch
 from pydantic import AliasChoices, BaseModel, BeforeValidator, Field
 from torch import Tensor
 
 from dsr.geometry.camera import ASSUMED_FOV, Camera, RangeType, expect_intrinsics
 from dsr.geometry.plausible import implausible_distance, judge_camera, may_be_of, plausible_baseline
-from dsr.geometry.resampling import registered_camera, warp_depth
-from dsr.io.frames import Rig
 from dsr.io.images import Pixels, Size, pixels_in_header
-from dsr.io.photos import focal_in_exif, orientation_of, same_aspect
-from dsr.io.reading import CameraChoice, RigFiles
-from dsr.io.trajectories import intrinsics_camera, read_transform
+from dsr.io.photos import read_exif, same_aspect
+from dsr.io.reading import CameraChoice
+from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import naming, numbers_in, parse_json, read_text, refusing, split_numbers
 from dsr.utils.progress import show_length
@@ -56,7 +53,7 @@ def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) ->
         return CameraFile(Camera(width, height, *choice.intrinsics)), []
     if choice.fov is not None:
         return CameraFile(Camera.from_fov(choice.fov, width, height)), []
-    equivalent = focal_in_exif(photo)
+    equivalent = read_exif(photo).focal
     if equivalent is not None:
         focal = equivalent / _FILM_DIAGONAL * math.hypot(width, height)
         assumption = Assumption(
@@ -80,7 +77,14 @@ def read_any_camera(path: Path) -> CameraFile | np.ndarray:
     if "camera_matrix:" in text:
         return _of_yaml(path, text)
     if path.suffix.lower() != ".json" and not text.lstrip().startswith("{"):
-        return _matrix(path, text)
+        numbers = numbers_in(split_numbers(text))
+        if len(numbers) == 4:
+            numbers = [numbers[0], 0, numbers[2], 0, *numbers[1::2], 0, 0, 1]
+        if len(numbers) not in (9, 16):
+            raise ValueError(f"{path}: expected JSON or a matrix of 3 x 3 or 4 x 4 numbers, got something else")
+        side = math.isqrt(len(numbers))
+        with naming(path):
+            return expect_intrinsics(np.array(numbers).reshape(side, side))
     if '"fov_x"' in text:
         with refusing(f"{path}: expected fov_x and fov_y in degrees", ValueError, TypeError, KeyError, ArithmeticError):
             fx, fy = (0.5 / math.tan(math.radians(parse_json(text)[name]) / 2) for name in ("fov_x", "fov_y"))
@@ -89,8 +93,8 @@ def read_any_camera(path: Path) -> CameraFile | np.ndarray:
         stored = parse_model(_Open3d, text, path)
         with naming(path):
             matrix = expect_intrinsics(np.array(stored.intrinsic_matrix).reshape(3, 3).T)
-            numbers = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
-            return CameraFile(Camera(stored.width, stored.height, *numbers))
+            intrinsics = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+            return CameraFile(Camera(stored.width, stored.height, *intrinsics))
     return _of_json(path, text)
 
 
@@ -185,7 +189,7 @@ def _fit_to_photo(
     camera, orientation = content.camera, 1
     across = not same_aspect((camera.height, camera.width), size) and same_aspect((camera.width, camera.height), size)
     if across and pixels_in_header(photo) != size:
-        orientation = orientation_of(photo)
+        orientation = read_exif(photo).orientation
     if orientation >= 5:  # the photo is turned, the camera is that of the sensor
         cx = camera.height - 1 - camera.cy if orientation in (6, 7) else camera.cy
         cy = camera.width - 1 - camera.cx if orientation in (7, 8) else camera.cx
@@ -232,18 +236,6 @@ def _camera_of_matrix(path: Path, matrix: np.ndarray, size: Size, size_lr: Size)
     )
 
 
-def _matrix(path: Path, text: str) -> np.ndarray:
-    """Return the intrinsics (3, 3) that a text holds."""
-    numbers = numbers_in(split_numbers(text))
-    if len(numbers) == 4:
-        numbers = [numbers[0], 0, numbers[2], 0, *numbers[1::2], 0, 0, 1]
-    if len(numbers) not in (9, 16):
-        raise ValueError(f"{path}: expected JSON or a matrix of 3 x 3 or 4 x 4 numbers, got something else")
-    side = math.isqrt(len(numbers))
-    with naming(path):
-        return expect_intrinsics(np.array(numbers).reshape(side, side))
-
-
 def _of_yaml(path: Path, text: str) -> CameraFile:
     """Return the camera of OpenCV's YAML, whose header and tags other readers refuse."""
     found = re.findall(r"^(\w+):.*(?:\n[ \t]+(?!data:).*)*\n[ \t]+data:\s*\[([^\]]*)\]", text, re.MULTILINE)
@@ -256,36 +248,6 @@ def _of_yaml(path: Path, text: str) -> CameraFile:
     fx, _, cx, _, fy, cy, *_ = lists["camera_matrix"]
     size = int(sizes["height"]), int(sizes["width"])
     return CameraFile(intrinsics_camera(str(path), size, (fx, fy, cx, cy)))
-
-
-def read_rig(files: RigFiles, size_lr: Size, baseline: float | None) -> Rig:
-    """Read the camera of a depth map of ``size_lr`` = (height, width), and its transform to the photo's camera.
-
-    ``baseline``: metres between the two cameras of disparities, if the map has such.
-    """
-    content = read_any_camera(files.camera)
-    if isinstance(content, np.ndarray):
-        camera = Camera(size_lr[1], size_lr[0], content[0, 0], content[1, 1], content[0, 2], content[1, 2])
-    else:
-        camera = scale_camera(files.camera, content.camera, size_lr)
-    camera = camera if baseline is None else replace(camera, baseline=baseline)
-    return Rig(camera, read_transform(files.extrinsics))
-
-
-def to_photo(depth_lr: Tensor, rig: Rig, photo: Camera, place: str) -> tuple[Tensor, Assumption]:
-    """Return a depth camera's map, (1, h, w) in metres, as the photo's camera sees it, (1, h', w'), and a note.
-
-    It is as fine as the depth map is, in the photo's field of view; a message begins with ``place``.
-    """
-    target = registered_camera(rig.camera, photo)
-    warped = warp_depth(depth_lr[None], rig.camera, torch.from_numpy(rig.transform)[None], target)[0]
-    if not bool(warped.isfinite().any()):
-        raise ValueError(
-            f"{place}: expected the transform from the depth camera's frame to the photo camera's, in metres; with "
-            "this one the photo shows nothing of the depth map"
-        )
-    holes = f"{target.width} x {target.height}, {float(warped.isnan().float().mean()):.1%} holes"
-    return warped, Assumption("the depth map is warped into the photo's view", holes)
 
 
 def doubt_camera(camera: Camera, whose: str, size_lr: tuple[int, int] | None = None) -> list[Assumption]:

@@ -161,7 +161,12 @@ def find_holes(
         )
         for name, fraction in found.items()
     ]
-    return holes, _mark(values, found, hole_value), assumptions
+    if hole_value:
+        return holes, hole_value, assumptions
+    if values.dtype.kind in "iu":
+        return holes, 0.0, assumptions
+    usual = max((name for name in found if name != "below 0"), key=found.__getitem__, default="")
+    return holes, {"0": 0.0, "infinity": math.inf}.get(usual, math.nan), assumptions
 
 
 def far_marks(values: np.ndarray, known: np.ndarray) -> list[float]:
@@ -190,16 +195,6 @@ def expect_known(name: object, values: np.ndarray, holes: np.ndarray) -> None:
         negative = float((values < 0).mean())
         what = f"{negative:.0%} are negative (along an axis that points backwards?), the others holes"
         raise ValueError(f"{name}: expected at least one known pixel, {what if negative else 'all are holes'}")
-
-
-def _mark(values: np.ndarray, found: dict[str, float], hole_value: float | None) -> float:
-    """Return the value that most holes have."""
-    if hole_value:
-        return hole_value
-    if values.dtype.kind in "iu":
-        return 0.0
-    found = {name: fraction for name, fraction in found.items() if name != "below 0"}
-    return {"0": 0.0, "infinity": math.inf}.get(max(found, key=found.__getitem__, default=""), math.nan)
 
 
 def decode(values: np.ndarray, holes: np.ndarray, encoding: Encoding, camera: Camera) -> Tensor:

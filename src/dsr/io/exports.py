@@ -112,7 +112,7 @@ def write_renderings(folder: Path, depth: Tensor, camera: Camera) -> list[Path]:
     known = np.zeros(shades.shape[1:], bool)
     for rows, normals in normal_strips(depth, camera):
         known[rows] = normals[0].isfinite().numpy()
-        shades[:, rows] = _bytes(render(normals[None])[0])
+        shades[:, rows] = as_bytes(render(normals[None])[0])
     paths = [folder / f"{name}.png" for name in LIGHT_NAMES]
     for path, picture in zip(paths, shades, strict=True):
         write_png(path, picture, known)
@@ -130,13 +130,8 @@ def write_normals(path: Path, depth: Tensor, camera: Camera) -> None:
     signs = torch.tensor([-1, -1, 1])[:, None, None]  # blue, green, red is -z, -y, x
     for rows, normals in normal_strips(depth, camera):
         known[rows] = normals[0].isfinite().numpy()
-        picture[rows] = _bytes((1 + signs * normals.flip(0)) / 2).transpose(1, 2, 0)
+        picture[rows] = as_bytes((1 + signs * normals.flip(0)) / 2).transpose(1, 2, 0)
     write_png(path, picture, known)
-
-
-def write_mask(path: Path, mask: Tensor) -> None:
-    """Write a mask, (1, H, W) bool, as an 8-bit picture: 255 where it holds, else 0."""
-    write_png(path, 255 * mask[0].byte().cpu().numpy())
 
 
 def write_cloud(
@@ -190,7 +185,7 @@ def write_mesh(
         if path.suffix.lower() == ".ply":
             write_ply(path, mesh.vertices, colours, normals, mesh.faces, filled=flags)
         else:
-            places, photo = project(mesh.vertices, camera), _bytes(rgb).transpose(1, 2, 0).copy()
+            places, photo = project(mesh.vertices, camera), as_bytes(rgb).transpose(1, 2, 0).copy()
             write_glb(path, mesh.vertices, normals, mesh.faces, places, photo, flags)
     return Written(before, len(mesh.faces), how)
 
@@ -296,18 +291,17 @@ class _Glb:
 def _at(pixels: np.ndarray, rgb: Tensor, filled: Tensor | None) -> tuple[np.ndarray, np.ndarray | None]:
     """Return colours, (N, 3) uint8, and values of a mask, (N,) bool, at some pixels, indices of the flattened map."""
     flags = None if filled is None else filled.flatten().cpu().numpy()[pixels]
-    return _bytes(rgb.flatten(1)[:, torch.from_numpy(pixels)]).T, flags
+    return as_bytes(rgb.flatten(1)[:, torch.from_numpy(pixels)]).T, flags
 
 
-def _bytes(values: Tensor) -> np.ndarray:
+def as_bytes(values: Tensor) -> np.ndarray:
     """Return values in [0, 1] as uint8; NaN becomes 0."""
     return (values.nan_to_num(0) * 255).round().clamp(0, 255).byte().cpu().numpy()
 
 
 def write_input(path: Path, rgb: Tensor, depth_lr: Tensor) -> None:
     """Write the input: ``depth_lr`` (h, w) float32 in metres, NaN in holes, and ``photo``, the bytes of a JPEG."""
-    pixels = (255 * rgb).round().clamp(0, 255).byte().permute(1, 2, 0).cpu().numpy()
-    photo = np.frombuffer(to_jpeg(pixels, LONGEST, 90), np.uint8)
+    photo = np.frombuffer(to_jpeg(as_bytes(rgb).transpose(1, 2, 0), LONGEST, 90), np.uint8)
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, depth_lr=depth_lr[0].float().cpu().numpy(), photo=photo)
 

@@ -20,10 +20,8 @@ from dsr.io.cameras import (
     doubt_depth,
     find_camera,
     read_any_camera,
-    read_rig,
     scale_camera,
     scale_to_photo,
-    to_photo,
 )
 from dsr.io.depth_files import (
     ICL_CAMERA,
@@ -38,8 +36,9 @@ from dsr.io.depth_files import (
 from dsr.io.frames import SLACK, Geometry, Rig
 from dsr.io.images import Size, pixels_in_header, read_mask
 from dsr.io.pairs import Pair, find_camera_file, role_of_words, words_of
-from dsr.io.photos import model_in_exif, read_photo, same_aspect
+from dsr.io.photos import read_exif, read_photo, same_aspect
 from dsr.io.reading import SUNRGBD_BITS, CameraChoice, Reading
+from dsr.io.trajectories import read_transform
 from dsr.io.units import TURNED_BACK, Meaning, expect_narrow, interpret
 from dsr.notes import LIMITS, Assumption
 from dsr.sample import FARTHEST, NEAREST
@@ -165,7 +164,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
         tuple(notes),
         geometry.pose,
         None if confidence is None or rig is not None else torch.from_numpy(confidence)[None],
-        device_name=model_in_exif(pair.rgb) if pair.capture is None else pair.capture.app,
+        device_name=read_exif(pair.rgb).model if pair.capture is None else pair.capture.app,
         up=geometry.up,
         time=pair.named_time if pair.time is None else pair.time,
     )
@@ -365,7 +364,13 @@ def _camera(
 def _rig(pair: Pair, reading: Reading, geometry: Geometry, size_lr: Size) -> Rig | None:
     """Return the rig that the user gives, else the capture's; None if the depth map is in the photo's view."""
     if reading.rig is not None:
-        return read_rig(reading.rig, size_lr, reading.baseline)
+        content = read_any_camera(reading.rig.camera)
+        if isinstance(content, np.ndarray):
+            camera = Camera(size_lr[1], size_lr[0], content[0, 0], content[1, 1], content[0, 2], content[1, 2])
+        else:
+            camera = scale_camera(reading.rig.camera, content.camera, size_lr)
+        camera = camera if reading.baseline is None else replace(camera, baseline=reading.baseline)
+        return Rig(camera, read_transform(reading.rig.extrinsics))
     if pair.capture is None or geometry.rig is None:
         return None
     camera = scale_camera(str(pair.capture.description), geometry.rig.camera, size_lr)
@@ -375,13 +380,18 @@ def _rig(pair: Pair, reading: Reading, geometry: Geometry, size_lr: Size) -> Rig
 def _to_photo(
     pair: Pair, reading: Reading, depth_lr: Tensor, rig: Rig, photo: Camera, rgb: Tensor, notes: list[Assumption]
 ) -> Tensor:
-    """Return a depth camera's map in the photo's view."""
-    given = reading.rig is not None
+    """Return a depth camera's map, (1, h, w), as the photo's camera sees it, (1, h', w'), as fine as it is."""
+    given, target = reading.rig is not None, registered_camera(rig.camera, photo)
     notes += doubt_camera(rig.camera, "--depth-camera" if given else "depth camera")
-    warped, note = to_photo(depth_lr, rig, photo, "--extrinsics" if given else _camera_source(pair, reading))
+    warped = warp_depth(depth_lr[None], rig.camera, torch.from_numpy(rig.transform)[None], target)[0]
+    if not bool(warped.isfinite().any()):
+        raise ValueError(
+            f"{'--extrinsics' if given else _camera_source(pair, reading)}: expected the transform from the depth "
+            "camera's frame to the photo camera's, in metres; with this one the photo shows nothing of the depth map"
+        )
     if given:
         inverse = torch.from_numpy(np.linalg.inv(rig.transform))[None]
-        other = warp_depth(depth_lr[None], rig.camera, inverse, registered_camera(rig.camera, photo))[0]
+        other = warp_depth(depth_lr[None], rig.camera, inverse, target)[0]
         verdict, better = (judge(each[0].double().numpy(), rgb, zooms=()) for each in (warped, other))
         if verdict is not None and better is not None and better.contours:
             gain = better.as_given.significance - max(verdict.as_given.significance, 0)
@@ -389,7 +399,8 @@ def _to_photo(
                 text = "--extrinsics: the photo's edges fit better with the inverse matrix"
                 detail = f"{better.figures}; expected the transform from the depth camera's frame to the photo camera's"
                 notes.append(Assumption(text, detail, "extrinsics-inverse", gain))
-    notes.append(note)
+    holes = f"{target.width} x {target.height}, {float(warped.isnan().float().mean()):.1%} holes"
+    notes.append(Assumption("the depth map is warped into the photo's view", holes))
     return warped
 
 

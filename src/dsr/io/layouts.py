@@ -242,18 +242,13 @@ def _side_by_side(folder: Path) -> PairingResult:
     photos = [path for path, role in roles.items() if role == "rgb"]
     depths = [path for path, role in roles.items() if role == "depth"]
     if not depths:  # then depth maps are recognised by their single channel of 16 bits or floats
-        depths = [path for path in photos if path.suffix.lower() in DEPTH_SUFFIXES and _is_depth_map(path)]
+        for path in photos:
+            with contextlib.suppress(ValueError):  # it is damaged
+                pixels = read_pixels(path, cv2.IMREAD_UNCHANGED) if path.suffix.lower() in DEPTH_SUFFIXES else None
+                if pixels is not None and pixels.ndim == 2 and pixels.dtype != np.uint8:
+                    depths.append(path)
         photos = [path for path in photos if path not in depths]
     return match_pairs(photos, depths)
-
-
-def _is_depth_map(path: Path) -> bool:
-    """Return whether a picture has one channel of more than 8 bits."""
-    try:
-        pixels = read_pixels(path, cv2.IMREAD_UNCHANGED)
-    except ValueError:
-        return False
-    return pixels.ndim == 2 and pixels.dtype != np.uint8
 
 
 def _describe_content(folder: Path) -> str:

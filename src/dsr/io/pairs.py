@@ -243,7 +243,17 @@ def add_confidence(pairs: Sequence[Pair], given: Sequence[Path]) -> tuple[Pair, 
         if not path.exists():
             raise ValueError(f"--confidence: {path}: no such file or folder")
     if len(given) == 1 and given[0].is_dir():
-        paths = _match_confidence(pairs, given[0])
+        maps = {}
+        for path in sorted(given[0].iterdir()):
+            if path.suffix.lower() in CONFIDENCE_SUFFIXES:
+                maps[tuple(word for word in key_of(path) if word not in _CONFIDENCE)] = path
+        found = [maps.get(key_of(pair.depth)) or maps.get(key_of(pair.rgb)) for pair in pairs]
+        paths = [path for path in found if path is not None]
+        if missing := [pair.name for pair, path in zip(pairs, found, strict=True) if path is None]:
+            raise ValueError(
+                f"--confidence: {given[0]}: expected a map for each of the {len(pairs)} depth maps, there is none for "
+                f"{len(missing)}, such as {missing[0]}"
+            )
     elif any(path.is_dir() for path in given) or len(given) != len(pairs):
         raise ValueError(
             f"--confidence: expected a folder, or as many maps as photos, got {len(given)} for {len(pairs)} photos"
@@ -254,22 +264,6 @@ def add_confidence(pairs: Sequence[Pair], given: Sequence[Path]) -> tuple[Pair, 
     return tuple(
         replace(pair, confidence=ConfidenceMap(path, highest)) for pair, path in zip(pairs, paths, strict=True)
     )
-
-
-def _match_confidence(pairs: Sequence[Pair], folder: Path) -> list[Path]:
-    """Return the maps of a folder that have the names of the pairs' depth maps or photos."""
-    maps = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() in CONFIDENCE_SUFFIXES:
-            maps[tuple(word for word in key_of(path) if word not in _CONFIDENCE)] = path
-    found = [maps.get(key_of(pair.depth)) or maps.get(key_of(pair.rgb)) for pair in pairs]
-    missing = [pair.name for pair, path in zip(pairs, found, strict=True) if path is None]
-    if missing:
-        raise ValueError(
-            f"--confidence: {folder}: expected a map for each of the {len(pairs)} depth maps, there is none for "
-            f"{len(missing)}, such as {missing[0]}"
-        )
-    return [path for path in found if path is not None]
 
 
 def list_pictures(folder: Path) -> list[Path]:

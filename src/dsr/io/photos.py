@@ -11,7 +11,7 @@ import struct
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -46,7 +46,7 @@ def _turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 def read_photo(path: Path, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]:
     """Return the photo, (H, W, 3) uint8 RGB, turned upright only if the depth map fits so, and the assumptions."""
-    orientation, found = orientation_of(path), list[Assumption]()
+    orientation, found = read_exif(path).orientation, list[Assumption]()
     if path.suffix.lower() in HEIC_SUFFIXES:
         turned = 1 if orientation == 1 else turned_in_heic(path)
         pixels = _turn(read_heic(path), _BACK.get(turned, turned))
@@ -136,20 +136,17 @@ def same_aspect(first: Size, second: Size) -> bool:
     return abs(first[0] * second[1] / (first[1] * second[0]) - 1) <= _ASPECT_TOLERANCE
 
 
-def focal_in_exif(photo: Path) -> float | None:
-    """Return the equivalent focal length for 35 mm film in the EXIF data, in millimetres; None if there is none."""
-    value = _exif(photo).get(_EXIF_FOCAL_35)
-    return float(value) if isinstance(value, (int, float)) and 1 < value < 10_000 else None
+class Exif(NamedTuple):
+    """The EXIF data of a photo, as far as they make sense."""
+
+    focal: float | None  # the equivalent focal length for 35 mm film in millimetres
+    model: str  # the name of the device; empty if there is none
+    orientation: int  # 1 (as it is) to 8; 1 if there is none
 
 
-def model_in_exif(photo: Path) -> str:
-    """Return the name of the device in the EXIF data; empty if there is none."""
-    value = _exif(photo).get(_MODEL)
-    return value if isinstance(value, str) else ""
-
-
-def _exif(photo: Path) -> dict[int, Any]:
-    """Return the EXIF data of the photo, empty where there are none."""
+def read_exif(photo: Path) -> Exif:
+    """Return the EXIF data of a photo; those that are missing or damaged are ignored."""
+    found: dict[int, Any] = {}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of data that are damaged
@@ -159,15 +156,15 @@ def _exif(photo: Path) -> dict[int, Any]:
             else:
                 with opened(photo) as file, Image.open(file) as image:
                     exif = image.getexif()
-            return {**dict(exif), **exif.get_ifd(_EXIF_IFD)}
-    except Exception:  # damaged data are ignored
-        return {}
-
-
-def orientation_of(photo: Path) -> int:
-    """Return the EXIF orientation of the photo, 1 (as it is) to 8; 1 where there is none."""
-    value = _exif(photo).get(_ORIENTATION, 1)
-    return value if isinstance(value, int) and 1 <= value <= 8 else 1
+            found = {**dict(exif), **exif.get_ifd(_EXIF_IFD)}
+    except Exception:  # of any kind, by Pillow
+        found = {}
+    focal, model, orientation = (found.get(tag) for tag in (_EXIF_FOCAL_35, _MODEL, _ORIENTATION))
+    return Exif(
+        float(focal) if isinstance(focal, (int, float)) and 1 < focal < 10_000 else None,
+        model if isinstance(model, str) else "",
+        orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1,
+    )
 
 
 def write_png(path: Path, picture: np.ndarray, known: np.ndarray | None = None) -> None:

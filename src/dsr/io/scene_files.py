@@ -20,7 +20,7 @@ from torch import Tensor
 from dsr.geometry.camera import Camera
 from dsr.geometry.poses import quaternion_of
 from dsr.io.depth_files import read_depth_file
-from dsr.io.exports import world_comment, write_ply
+from dsr.io.exports import as_bytes, world_comment, write_ply
 from dsr.io.images import read_pixels
 from dsr.io.photos import encode_png, to_jpeg, write_png
 from dsr.io.trajectories import check_pose
@@ -78,16 +78,6 @@ def parse_pose(where: str, value: object) -> Tensor | None:
         return torch.from_numpy(check_pose(where, np.array(value, dtype=np.float64)))
 
 
-def _common_camera(frames: Sequence[Frame]) -> Camera | None:
-    """Return the camera of all frames, or None if they differ."""
-    return frames[0].camera if len({frame.camera for frame in frames}) == 1 else None
-
-
-def _common_up(frames: Sequence[Frame]) -> str:
-    """Return the axis that points up in the world of all frames, or "" if they differ."""
-    return frames[0].up if len({frame.up for frame in frames}) == 1 else ""
-
-
 def to_millimetres(depth: np.ndarray) -> tuple[np.ndarray, int]:
     """Return depth in metres as whole millimetres, (H, W) uint16 with 0 in holes, and how many pixels are too far.
 
@@ -123,8 +113,7 @@ def write_rgbd(folder: Path, rgb: Tensor, depth: Tensor, camera: Camera) -> list
     ``rgb``: (3, H, W) in [0, 1]. ``depth``: (1, H, W) in metres, NaN in holes.
     """
     millimetres, lost = to_millimetres(depth[0].cpu().numpy())
-    pixels = (rgb * 255).round().clamp(0, 255).byte().permute(1, 2, 0).cpu().numpy()
-    write_png(folder / RGBD[0], np.ascontiguousarray(pixels[..., ::-1]))
+    write_png(folder / RGBD[0], np.ascontiguousarray(as_bytes(rgb).transpose(1, 2, 0)[..., ::-1]))
     write_png(folder / RGBD[1], millimetres)
     _write_intrinsics(folder / RGBD[2], camera)
     if not lost:
@@ -143,9 +132,10 @@ def write_open3d(folder: Path, frames: Sequence[Frame]) -> list[Path]:
         files += _write_pictures(folder, ("color", "depth"), frame, to_millimetres(frame.read_depth())[0])
         rows.append(f"{number} {number} {number + 1}\n")
         rows += (" ".join(f"{value:.12g}" for value in row) + "\n" for row in frame.matrix)
-    camera = _common_camera(frames)
     cameras = {f"intrinsics/{frame.stem}.json": frame.camera for frame in frames}
-    for name, each in (cameras if camera is None else {RGBD[2]: camera}).items():
+    if len({frame.camera for frame in frames}) == 1:
+        cameras = {RGBD[2]: frames[0].camera}
+    for name, each in cameras.items():
         files.append(folder / name)
         _write_intrinsics(files[-1], each)
     if all(frame.pose is not None for frame in frames):
@@ -171,9 +161,11 @@ def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
     millimetres by default; ``depth_unit_scale_factor`` states it for other readers.
     """
     expect_poses("nerfstudio", {frame.name: frame.pose is not None for frame in frames})
-    camera, folder = _common_camera(frames), path.parent / "nerfstudio"
+    camera = frames[0].camera if len({frame.camera for frame in frames}) == 1 else None  # of all frames
+    up = frames[0].up if len({frame.up for frame in frames}) == 1 else ""
+    folder = path.parent / "nerfstudio"
     points = folder / "points.ply"
-    write_ply(points, *_sparse(frames), frame=world_comment(_common_up(frames)))
+    write_ply(points, *_sparse(frames), frame=world_comment(up))
     files, entries = list[Path](), list[dict[str, Any]]()
     for frame in frames:
         pictures = _write_pictures(folder, ("images", "depths"), frame, to_millimetres(frame.read_depth())[0])
@@ -284,7 +276,8 @@ def write_rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:
     recording = rerun.RecordingStream("dsr")
     with replacing(path) as temporary:
         recording.save(str(temporary))
-        axes = {"": "RDF", "y": "RUB", "z": "RFU"}[_common_up(frames)]
+        up = frames[0].up if len({frame.up for frame in frames}) == 1 else ""
+        axes = {"": "RDF", "y": "RUB", "z": "RFU"}[up]
         recording.log("/", getattr(rerun.ViewCoordinates, axes), static=True)
         timed = all(frame.time is not None for frame in frames)
         for number, frame in enumerate(frames):

@@ -44,11 +44,20 @@ class Trajectory:
         if self.times is not None:
             named = np.array([pair.named_time for pair in pairs], np.float64)  # None becomes NaN
             own = np.array([pair.time for pair in pairs], np.float64)
-            numbers = np.array([_number(pair) for pair in pairs], np.float64)
+            numbers = np.full(len(pairs), np.nan)  # the last ones in the names, unless they are fractions of times
+            for place, pair in enumerate(pairs):
+                words = re.findall(r"\d+", pair.depth.stem)
+                fraction = pair.named_time is not None and "." in pair.depth.stem
+                if words and len(words[-1]) < 16 and not fraction:
+                    numbers[place] = float(words[-1])
             ways = [(own, _MAX_GAP), *(way for way in ((named, _MAX_GAP), (numbers, 0.0)) if np.isfinite(way[0]).all())]
-            found = [self._nearest(pairs, *way) for way in ways]
+            nearest = [self.at(*way) for way in ways]
             if self.ids is not None:
-                found.append(replace(self, times=self.ids)._nearest(pairs, numbers, 0.0))
+                nearest.append(replace(self, times=self.ids).at(numbers, 0.0))
+            found = [
+                {pair.name: pose for pair, pose in zip(pairs, poses, strict=True) if pose is not None}
+                for poses in nearest
+            ]
             if best := max(found, key=len):
                 return best
             for known, where in ((own, "those of the frames"), (named, "in the names of the frames")):
@@ -63,11 +72,6 @@ class Trajectory:
                 f"{len(self.poses)} poses"
             )
         return {pair.name: pose for pair, pose in zip(pairs, self.poses, strict=True) if pose is not None}
-
-    def _nearest(self, pairs: Sequence[Pair], wanted: np.ndarray, gap: float) -> Mapping[str, Matrix]:
-        """Return the poses nearest in time by the names of the frames; of those that have one."""
-        poses = self.at(wanted, gap)
-        return {pair.name: pose for pair, pose in zip(pairs, poses, strict=True) if pose is not None}
 
     def at(self, wanted: np.ndarray, gap: float = _MAX_GAP) -> list[Matrix | None]:
         """Return the pose nearest to each time, None for those without one within a gap in seconds, as for NaN."""
@@ -176,14 +180,6 @@ def _matrix_of_json(path: Path, text: str) -> list[list[float]]:
     if not isinstance(content, list):
         raise ValueError(f"{path}: expected a matrix of 3 x 4 or 4 x 4 numbers, got something else")
     return content
-
-
-def _number(pair: Pair) -> float | None:
-    """Return the last number in a frame's name; None if it is the fraction of a time."""
-    numbers = re.findall(r"\d+", pair.depth.stem)
-    if pair.named_time is not None and "." in pair.depth.stem:
-        return None
-    return float(numbers[-1]) if numbers and len(numbers[-1]) < 16 else None
 
 
 def pose_from_quaternion(

@@ -67,8 +67,12 @@ def interpret(
     votes = InverseVotes(0, 0)
     if conclusive and may_fall:
         votes = inverse_votes(np.where(holes, np.nan, values.astype(np.float64)))
+    sparse = bool(holes.mean() > _SPARSE)
+    scattered = sparse and bool((~holes[1:] & ~holes[:-1]).sum() < _SCATTERED * known.size)
+    of_kitti = values.shape[1] in _KITTI_WIDTHS and values.shape[0] in _KITTI_HEIGHTS
     middle, highest = float(np.median(known)), float(known.max())
-    seen = _Map(name, values, holes, camera, may_fall, sample, middle, highest, conclusive, votes)
+    clues = conclusive, sparse, scattered, of_kitti
+    seen = _Map(name, values, holes, camera, may_fall, sample, middle, highest, *clues, votes)
     return _interpret_floats(seen) if values.dtype.kind == "f" else _interpret_whole(seen)
 
 
@@ -84,24 +88,10 @@ class _Map(NamedTuple):
     middle: float  # the median
     highest: float
     conclusive: bool  # whether there are enough different values
+    sparse: bool  # whether most pixels are missing
+    scattered: bool  # whether the known pixels are single ones, as of a laser scanner
+    of_kitti: bool  # whether the map has one of the sizes of KITTI
     votes: InverseVotes  # of the planes; none for what cannot be disparities
-
-    @property
-    def sparse(self) -> bool:
-        """Whether most pixels are missing."""
-        return bool(self.holes.mean() > _SPARSE)
-
-    @property
-    def scattered(self) -> bool:
-        """Whether the known pixels are single ones, as of a laser scanner."""
-        known = ~self.holes
-        return self.sparse and (known[1:] & known[:-1]).sum() < _SCATTERED * known.sum()
-
-    @property
-    def of_kitti(self) -> bool:
-        """Whether the map has one of the sizes of KITTI."""
-        height, width = self.values.shape
-        return width in _KITTI_WIDTHS and height in _KITTI_HEIGHTS
 
     def metres(self, unit: float) -> str:
         """Return the median in a unit."""
@@ -111,13 +101,6 @@ class _Map(NamedTuple):
         """Raise the error that asks for one of several units, by their names for ``--depth-unit``."""
         readings = " or ".join(f"--depth-unit {name} (median {self.metres(unit)})" for name, unit in units)
         raise ValueError(f"{self.name}: expected {readings}: {why}")
-
-
-def _compact(holes: np.ndarray) -> bool:
-    """Return whether most known pixels have known pixels on all four sides, as of an object that was cut out."""
-    known = np.pad(~holes, 1)
-    sides = known[:-2, 1:-1] & known[2:, 1:-1] & known[1:-1, :-2] & known[1:-1, 2:]
-    return bool((sides & known[1:-1, 1:-1]).sum() > known.sum() / 2)
 
 
 def _multiples(values: np.ndarray, step: int, share: float = _MOST) -> bool:
@@ -207,8 +190,12 @@ def _by_median(seen: _Map) -> Meaning:
         if seen.conclusive and near < LIMITS["near-millimetres"]:
             text = "everything is near if whole numbers are millimetres: are they centimetres? --depth-unit mm or cm"
             found.append(Assumption(text, f"99 % within {show_length(near, 2)}", "near-millimetres", near))
-        if seen.sparse and not _compact(seen.holes):
-            found.append(Assumption("that is sparse, as of a laser scanner: KITTI stores 1/256 m (--depth-unit 1/256)"))
+        if seen.sparse:
+            known = np.pad(~seen.holes, 1)
+            sides = known[:-2, 1:-1] & known[2:, 1:-1] & known[1:-1, :-2] & known[1:-1, 2:]
+            if (sides & known[1:-1, 1:-1]).sum() <= known.sum() / 2:  # not an object that was cut out
+                text = "that is sparse, as of a laser scanner: KITTI stores 1/256 m (--depth-unit 1/256)"
+                found.append(Assumption(text))
         return Meaning(1e-3, tuple(found))
     for unit, label in _OTHER_UNITS:
         if _MIN_MEDIAN <= middle * unit <= _MAX_MEDIAN:

@@ -44,7 +44,10 @@ def picture_of(
         raise ValueError(f"depth: expected a map of shape (h, w), got {_kind(given)}")
     depth_lr, encoding = _metres(stored, unit, camera)
     if mask is not None:
-        depth_lr = depth_lr.masked_fill(~_mask(mask, stored.shape), torch.nan)
+        valid = torch.from_numpy(_as_array(_values(mask, "mask")) != 0)
+        if valid.shape[-2:] != stored.shape or valid.numel() != stored.size:
+            raise ValueError(f"mask: expected the depth's shape {stored.shape}, got {_kind(mask)}")
+        depth_lr = depth_lr.masked_fill(~valid.reshape(1, *stored.shape), torch.nan)
     if not (empty and bool(depth_lr.isnan().all())):
         expect_picture(photo, depth_lr, camera)
     if pose is not None:
@@ -102,23 +105,18 @@ def _metres(stored: np.ndarray, unit: str | float | None, camera: Camera) -> tup
             raise ValueError(
                 f"depth: expected floats in metres, or whole numbers with unit='mm', 'm' or 0.0002, got {kind}"
             )
-        _warn_of_marks(stored, np.isfinite(stored) & (stored > 0), "NaN")
+        holes, mark, usual = ~(np.isfinite(stored) & (stored > 0)), math.nan, "NaN"
+    else:
+        stored = turn_back_bits("depth", stored, SUNRGBD_BITS) if factor == "sunrgbd" else stored
+        holes, mark, _ = find_holes(stored, None, above=math.inf)
+        usual = "0"
+    for value in far_marks(stored, ~holes):  # an array has others for holes
+        warn([Assumption(f"depth: many pixels have {value:g}, far beyond all other values; a hole is {usual}")])
+    if factor is None:
         return torch.from_numpy(stored.astype(np.float32))[None], _METRES
-    bits = SUNRGBD_BITS if factor == "sunrgbd" else 0
-    stored = turn_back_bits("depth", stored, bits) if bits else stored
-    holes, mark, _ = find_holes(stored, None, above=math.inf)
-    _warn_of_marks(stored, ~holes, "0")
     suffix = ".png" if stored.dtype == np.uint16 else ".npy"
     encoding = Encoding(suffix, str(stored.dtype), 1e-3 if factor == "sunrgbd" else factor, mark, "orthogonal")
     return decode(stored, holes, encoding, camera.rescale(stored.shape[1], stored.shape[0])), encoding
-
-
-def _mask(mask: Any, size: tuple[int, ...]) -> Tensor:
-    """Return a valid mask, (1, h, w) bool."""
-    values = torch.from_numpy(_as_array(_values(mask, "mask")) != 0)
-    if values.shape[-2:] != size or values.numel() != math.prod(size):
-        raise ValueError(f"mask: expected the depth's shape {size}, got {_kind(mask)}")
-    return values.reshape(1, *size)
 
 
 def _values(given: Any, name: str) -> np.ndarray | Tensor:
@@ -144,9 +142,3 @@ def _kind(given: Any) -> str:
     if shape is None or dtype is None:
         return type(given).__name__
     return f"{'a tensor of ' if isinstance(given, Tensor) else ''}{dtype} of shape {tuple(shape)}"
-
-
-def _warn_of_marks(stored: np.ndarray, known: np.ndarray, hole: str) -> None:
-    """Warn of values that look like marks of holes; an array has others for them."""
-    for value in far_marks(stored, known):
-        warn([Assumption(f"depth: many pixels have {value:g}, far beyond all other values; a hole is {hole}")])

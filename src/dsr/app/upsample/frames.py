@@ -28,7 +28,6 @@ from dsr.io.pairs import (
 )
 from dsr.io.trajectories import read_poses
 from dsr.notes import LIMITS, Assumption
-from dsr.utils.guards import path_within
 
 
 @dataclass(frozen=True)
@@ -41,10 +40,6 @@ class Frames:
     units: FolderUnits  # units and range types, identified from the values of all of them
     # of :mod:`dsr.app.upsample.checks`, which looks at several frames, by the name of each frame
     warnings: Mapping[str, tuple[Assumption, ...]] = field(default_factory=dict)
-
-    def target(self, output: Path, pair: Pair) -> Path:
-        """Return the folder of a frame's results; OutsideError if a link leads it out of that of all."""
-        return output if self.single else path_within(output, pair.name, output)
 
 
 def find_frames(request: UpsampleRequest) -> Frames:
@@ -75,7 +70,14 @@ def _search(choice: FrameChoice, output: Path) -> PairingResult:
     try:
         parts = [find_pairs_of_folder(folder, output) for folder in choice.folders]
     except NoPairError as error:
-        _expect_both(choice.folders, error)
+        places = choice.folders  # may be a folder of photos and one of depth maps, if their names say so
+        roles = {path: _role(path) for path in places if path.exists()}
+        rgb, depth = ([path for path, role in roles.items() if role == wanted] for wanted in ("rgb", "depth"))
+        if len(places) == 2 and len(rgb) == len(depth) == 1:
+            raise ValueError(
+                f"{places[0]} and {places[1]}: expected folders that hold both; photos and depth maps apart are given "
+                f"as --rgb {rgb[0]} --depth {depth[0]}"
+            ) from error
         raise
     if len(parts) == 1:
         return parts[0]
@@ -88,17 +90,6 @@ def _search(choice: FrameChoice, output: Path) -> PairingResult:
         raise ValueError("expected folders of different names; give those of one name in commands of their own")
     facts = tuple(dict.fromkeys(fact for part in parts for fact in part.assumptions))
     return PairingResult(tuple(pairs), facts, tuple(path for part in parts for path in part.unpaired))
-
-
-def _expect_both(places: tuple[Path, ...], error: NoPairError) -> None:
-    """Say how photos and depth maps are named that came as two folders or files, where their names say so."""
-    roles = {path: _role(path) for path in places if path.exists()}
-    rgb, depth = ([path for path, role in roles.items() if role == wanted] for wanted in ("rgb", "depth"))
-    if len(places) == 2 and len(rgb) == len(depth) == 1:
-        raise ValueError(
-            f"{places[0]} and {places[1]}: expected folders that hold both; photos and depth maps apart are given as "
-            f"--rgb {rgb[0]} --depth {depth[0]}"
-        ) from error
 
 
 def _role(path: Path) -> Role | None:

@@ -27,12 +27,12 @@ from dsr.io.exports import (
     Written,
     write_cloud,
     write_input,
-    write_mask,
     write_mesh,
     write_normals,
     write_renderings,
 )
 from dsr.io.inputs import Picture
+from dsr.io.photos import write_png
 from dsr.io.scene_files import RGBD, write_rgbd
 from dsr.methods.base import Surface
 from dsr.notes import CHECKS, Assumption
@@ -251,14 +251,12 @@ def _described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
 
 def as_stored(surface: Surface) -> Surface:
     """Return a surface with expected errors that are stored to the bit, so that parts added later are the same."""
-
-    def rounded(values: Tensor | None) -> Tensor | None:
-        if values is None:
-            return None
-        mantissa, exponent = torch.frexp(values.float())
-        return torch.ldexp((_ERROR_STEPS * mantissa).round() / _ERROR_STEPS, exponent)
-
-    rough = surface._replace(depth_error=rounded(surface.depth_error), angle_error=rounded(surface.angle_error))
+    rounded: dict[str, Tensor] = {}
+    for name, values in (("depth_error", surface.depth_error), ("angle_error", surface.angle_error)):
+        if values is not None:
+            mantissa, exponent = torch.frexp(values.float())
+            rounded[name] = torch.ldexp((_ERROR_STEPS * mantissa).round() / _ERROR_STEPS, exponent)
+    rough = surface._replace(depth_error=rounded.get("depth_error"), angle_error=rounded.get("angle_error"))
     stored = {name: torch.from_numpy(values)[None].float() for name, values in rough.error_arrays().items()}
     return surface._replace(depth_error=stored.get("depth_error"), angle_error=stored.get("angle_error"))
 
@@ -296,7 +294,7 @@ def _write_maps(folder: Path, result: Result) -> dict[str, Output]:
         with replacing(folder / ERRORS) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **surface.error_arrays())
     if "filled" in names and surface.filled is not None:
-        write_mask(folder / "filled.png", surface.filled)
+        write_png(folder / "filled.png", 255 * surface.filled[0].byte().cpu().numpy())
     if "input" in names:
         write_input(folder / INPUT, picture.rgb, picture.depth_lr)
     if "rgbd" in names:

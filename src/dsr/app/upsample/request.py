@@ -170,14 +170,9 @@ class Upsampling(Options):
         given = {name: getattr(self, name) for name in SHORTCUTS}
         return dict(self.settings) | {name: value for name, value in given.items() if value is not None}
 
-    @property
-    def working_size(self) -> int | None:
-        """The divisor of the map's size before upsampling; None to choose it by the noise."""
-        return None if self.size == "auto" else int(self.size)
-
     def check_slowly(self) -> None:
         """Run the checks that take seconds: that the method accepts its arguments, and the name of the sensor."""
-        if self.arguments or self.working_size is not None:
+        if self.arguments or self.size != "auto":
             run = replace(self, device="cpu").upsampler()
             try:
                 run.check_working_size()
@@ -207,7 +202,7 @@ class Upsampling(Options):
             device=self.device,
             fill=self.fill,
             max_hole=self.max_hole,
-            working_size=self.working_size,
+            working_size=None if self.size == "auto" else int(self.size),
         )
 
 

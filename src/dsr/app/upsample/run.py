@@ -33,7 +33,7 @@ from dsr.methods.glass import NOTED
 from dsr.notes import Assumption, expect_no_warning
 from dsr.utils.console import ConsoleProgress, one_line, show
 from dsr.utils.files import expect_targets, write_text
-from dsr.utils.guards import readable, refusing_excess
+from dsr.utils.guards import path_within, readable, refusing_excess
 from dsr.utils.processes import Pool, at_work, scene_lock
 from dsr.utils.progress import Progress, clock, megabytes, show_length
 
@@ -151,7 +151,8 @@ def work_through(request: UpsampleRequest, frames: Frames, tell: Tell, progress:
 
     Notes are shown in the order of the frames, or as they come from several workers.
     """
-    jobs = [(pair, frames.target(request.results.output, pair)) for pair in frames.found.pairs]
+    output = request.results.output  # the folder of a single frame; no link leads those of several out of it
+    jobs = [(pair, output if frames.single else path_within(output, pair.name, output)) for pair in frames.found.pairs]
     workers = min(request.frames.workers, len(jobs))
     work = FrameWork(request, frames)  # raises for poses that do not fit
     frames = work.check_together(jobs)
@@ -248,9 +249,14 @@ class FrameWork:
 
     def check_together(self, jobs: Sequence[tuple[Pair, Path]]) -> Frames:
         """Return the frames with the warnings that concern several of them, if any of the jobs is to be done."""
-        if any(self._is_to_do(*job) for job in jobs):
-            warnings = check_together(self._frames.whole, self._request.reading, self._read, self._sequence)
-            self._frames = replace(self._frames, warnings=warnings)
+        for pair, target in jobs:
+            done = False  # also if it cannot be read, which is reported when its turn comes
+            with contextlib.suppress(ValueError, OSError):
+                done = (target / INFO).is_file() and self._is_done(self._folder(pair, target))
+            if not done:
+                warnings = check_together(self._frames.whole, self._request.reading, self._read, self._sequence)
+                self._frames = replace(self._frames, warnings=warnings)
+                break
         return self._frames
 
     def __call__(self, pair: Pair, target: Path, tell: Tell, progress: Progress) -> Done:
@@ -313,13 +319,6 @@ class FrameWork:
 
     def _is_done(self, folder: ResultFolder) -> bool:
         return folder.is_done(self._request.results, checked=self._request.reading.strict)
-
-    def _is_to_do(self, pair: Pair, target: Path) -> bool:
-        """Return whether a frame is not complete; one that cannot be read is reported when its turn comes."""
-        try:
-            return not ((target / INFO).is_file() and self._is_done(self._folder(pair, target)))
-        except (ValueError, OSError):
-            return True
 
     def _expect_no_warning(self, pair: Pair, folder: ResultFolder, notes: Sequence[Assumption]) -> None:
         """Raise ValueError if one is a warning, and that is not allowed; with one line for all frames of a folder."""

@@ -22,7 +22,7 @@ from dsr.geometry.lights import FIGURE_LIGHT, Direction, direction_of
 from dsr.geometry.mesh import Mesh, triangulate, vertex_normals
 from dsr.geometry.surface import render_for_viewing, shade
 from dsr.inference.resizing import Plan
-from dsr.io.exports import normal_strips
+from dsr.io.exports import as_bytes, normal_strips
 from dsr.io.files import python_messages
 from dsr.io.inputs import Picture
 from dsr.io.photos import data_url
@@ -113,7 +113,7 @@ class Surface(Generic[Array]):
     def photo(self) -> Array:
         """The photo: (H, W, 3) uint8 as an array, (3, H, W) float32 in [0, 1] as a tensor."""
         rgb = self._picture.rgb
-        return cast("Array", _bytes(rgb).transpose(1, 2, 0) if self._device is None else rgb.to(self._device))
+        return cast("Array", as_bytes(rgb).transpose(1, 2, 0) if self._device is None else rgb.to(self._device))
 
     @property
     def camera(self) -> Camera:
@@ -144,8 +144,19 @@ class Surface(Generic[Array]):
             ValueError: there is no such light, or the direction has no length.
 
         """
-        direction = torch.tensor([_direction(light)], dtype=self._normals.dtype)
-        return self._give(shade(self._normals[None], direction)[0].clamp(0, 1))
+        if isinstance(light, str):
+            direction = list(direction_of(light))
+        else:
+            try:
+                given = np.asarray(light, np.float64)
+            except (TypeError, ValueError):
+                given = np.empty(0)
+            length = float(np.linalg.norm(given))
+            if given.shape != (3,) or not 0 < length < np.inf:
+                raise ValueError(f"light: expected a name, or three numbers that are not all 0, got {light!r:.60}")
+            direction = (given / length).tolist()
+        shaded = shade(self._normals[None], torch.tensor([direction], dtype=self._normals.dtype))
+        return self._give(shaded[0].clamp(0, 1))
 
     def points(self, max_error: float | None = Results.max_error) -> Points:
         """Return the pixels as points, as ``dsr upsample`` writes them to ``cloud.ply``.
@@ -199,7 +210,7 @@ class Surface(Generic[Array]):
             if unknown := sorted(options.keys() - set(_OPTIONS)):
                 raise ValueError(f"save: expected some of {', '.join(_OPTIONS)}, got {', '.join(unknown)}")
             wanted = Results(output=Path(folder), only=None if parts is None else tuple(parts), **options)
-            content = hashlib.sha256(self._found.depth.numpy().tobytes() + _bytes(self._picture.rgb).tobytes())
+            content = hashlib.sha256(self._found.depth.numpy().tobytes() + as_bytes(self._picture.rgb).tobytes())
             inputs = {"surface": {"sha256": content.hexdigest()}}  # which a folder of results has for its inputs
             path, limit = wanted.output, wanted.max_error / 100
             results = ResultFolder(path, inputs, {"max_error": limit}, overwrite=wanted.overwrite)
@@ -262,7 +273,7 @@ class Surface(Generic[Array]):
 
     def _colours(self, mesh: Mesh) -> np.ndarray:
         """Return the photo's colours at the vertices, (N, 3) uint8."""
-        return _bytes(self._picture.rgb.flatten(1)[:, torch.from_numpy(mesh.pixels)]).T
+        return as_bytes(self._picture.rgb.flatten(1)[:, torch.from_numpy(mesh.pixels)]).T
 
     def _give(self, values: Tensor | None) -> Array:
         """Return a map, (1, H, W), as the depth map was given."""
@@ -270,25 +281,6 @@ class Surface(Generic[Array]):
         return cast("Array", values[0].numpy().copy() if self._device is None else values.to(self._device, copy=True))
 
 
-def _direction(light: str | Direction | Sequence[float]) -> list[float]:
-    """Return a light's direction, of length 1."""
-    if isinstance(light, str):
-        return list(direction_of(light))
-    try:
-        direction = np.asarray(light, np.float64)
-    except (TypeError, ValueError):
-        direction = np.empty(0)
-    length = float(np.linalg.norm(direction))
-    if direction.shape != (3,) or not 0 < length < np.inf:
-        raise ValueError(f"light: expected a name, or three numbers that are not all 0, got {light!r:.60}")
-    return (direction / length).tolist()
-
-
 def _normals(depth: Tensor, camera: Camera) -> Tensor:
     """Return the normals of a depth map, (3, H, W) float32."""
     return torch.cat([part for _, part in normal_strips(depth, camera)], dim=1)
-
-
-def _bytes(rgb: Tensor) -> np.ndarray:
-    """Return values in [0, 1] as uint8."""
-    return (rgb * 255).round().clamp(0, 255).byte().numpy()

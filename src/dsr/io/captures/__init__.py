@@ -6,14 +6,13 @@ Other packages add readers by an entry point of the group ``dsr.captures`` that 
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
+from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dsr.io.captures.contract import Capture
+from dsr.io.captures.contract import Capture, has_any
 from dsr.utils.guards import refusing
 
 if TYPE_CHECKING:
@@ -24,14 +23,10 @@ _KINECT1 = "stairs far away, smeared edges, shadows beside near things"
 _STEREO = "blobs, guesses on blank walls, wrong depth on glass"
 
 
-def _lazy(name: str) -> Callable[[Path], Any]:
-    """Return ``module.function`` of this package, imported when it is called: the table alone needs no torch."""
+def _call(name: str, place: Path) -> Any:
+    """Call ``module.function`` of this package, which is imported now: the table alone needs no torch."""
     module, function = name.split(".")
-
-    def read(place: Path) -> Any:
-        return getattr(import_module(f"dsr.io.captures.{module}"), function)(place)
-
-    return read
+    return getattr(import_module(f"dsr.io.captures.{module}"), function)(place)
 
 
 CAPTURES = (
@@ -43,7 +38,7 @@ CAPTURES = (
         "tables of a real scan; pictures written by its format",
         _LIDAR,
         "https://github.com/strayrobots/scanner/blob/main/docs/format.md",
-        _lazy("stray.find"),
+        partial(_call, "stray.find"),
         marks=("odometry.csv", "camera_matrix.csv"),
         needs=("depth/*", "rgb.mp4 or rgb/*"),
     ),
@@ -55,7 +50,7 @@ CAPTURES = (
         "written by its format",
         _LIDAR,
         "https://github.com/PolyCam/polyform#polycams-data-format",
-        _lazy("arkit.find_polycam"),
+        partial(_call, "arkit.find_polycam"),
         marks=("keyframes/*",),
         needs=(
             "keyframes/images/*.jpg or keyframes/corrected_images/*.jpg",
@@ -71,7 +66,7 @@ CAPTURES = (
         "written by its format",
         _LIDAR,
         "https://github.com/apple/ARKitScenes/blob/main/DATA.md",
-        _lazy("arkit.find_arkitscenes"),
+        partial(_call, "arkit.find_arkitscenes"),
         marks=("lowres_depth/*", "lowres_wide.traj"),
         needs=("lowres_depth/*.png", "wide/*.png or color/*.png or lowres_wide/*.png"),
     ),
@@ -83,7 +78,7 @@ CAPTURES = (
         "two real scans, of 24 and 146 photos",
         _LIDAR,
         "https://github.com/laanlabs/3dScannerApp_samples",
-        _lazy("arkit.find_scanner_app"),
+        partial(_call, "arkit.find_scanner_app"),
         marks=("conf_00000.png", "frame_*.json"),
         needs=("frame_*.jpg", "frame_*.json", "depth_*.png or frame_*.exr"),
     ),
@@ -96,7 +91,7 @@ CAPTURES = (
         "written by its format",
         _LIDAR,
         "https://github.com/scannetpp/scannetpp/blob/main/iphone/prepare_iphone_data.py",
-        _lazy("scannet.find_scannetpp"),
+        partial(_call, "scannet.find_scannetpp"),
         marks=("pose_intrinsic_imu.json", "depth.bin"),
         needs=("pose_intrinsic_imu.json", "depth.bin or depth/*.png", "rgb.mkv or rgb.mp4 or rgb/*.jpg"),
     ),
@@ -108,8 +103,8 @@ CAPTURES = (
         "written by its format",
         _KINECT1,
         "https://github.com/ScanNet/ScanNet/blob/master/SensReader/python/SensorData.py",
-        _lazy("scannet.find_export"),
-        _lazy("scannet.read_sens"),
+        partial(_call, "scannet.find_export"),
+        partial(_call, "scannet.read_sens"),
         (".sens",),
         marks=("intrinsic/intrinsic_*.txt", "pose/*.txt"),
         needs=("color/*", "depth/*.png", "intrinsic/intrinsic_*.txt"),
@@ -122,7 +117,7 @@ CAPTURES = (
         "a real sequence of 1000 frames",
         _KINECT1,
         "https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/",
-        _lazy("data_sets.find_seven_scenes"),
+        partial(_call, "data_sets.find_seven_scenes"),
         marks=("*.pose.txt",),
         needs=("*.color.png or *.color.jpg", "*.depth.png"),
     ),
@@ -134,7 +129,7 @@ CAPTURES = (
         "real frames of two sensors",
         "Kinects, Xtion and RealSense",
         "https://rgbd.cs.princeton.edu/",
-        _lazy("data_sets.find_sunrgbd"),
+        partial(_call, "data_sets.find_sunrgbd"),
         marks=("depth_bfx/*",),
         needs=("image/*", "intrinsics.txt"),
     ),
@@ -146,7 +141,7 @@ CAPTURES = (
         "written by its format",
         "",
         "https://github.com/cvg/nice-slam/blob/master/src/utils/datasets.py",
-        _lazy("data_sets.find_replica"),
+        partial(_call, "data_sets.find_replica"),
         marks=("results/depth*.png",),
         needs=("results/frame*", "traj.txt or cam_params.json"),
     ),
@@ -158,7 +153,7 @@ CAPTURES = (
         "written by its format; calibrations as other programs' tests have them",
         _STEREO,
         "https://github.com/stereolabs/zed-open-capture",
-        _lazy("data_sets.find_zed"),
+        partial(_call, "data_sets.find_zed"),
         marks=("SN*.conf", "left000000.png"),
         needs=("left*.png", "depth*.png", "SN*.conf"),
     ),
@@ -170,8 +165,8 @@ CAPTURES = (
         "a real export of 341 frames",
         _LIDAR,
         "https://github.com/marek-simonik/record3d/issues/27",
-        _lazy("record3d.find"),
-        _lazy("record3d.read_archive"),
+        partial(_call, "record3d.find"),
+        partial(_call, "record3d.read_archive"),
         (".r3d",),
         marks=("rgbd/*.depth",),
         needs=("metadata",),
@@ -184,8 +179,8 @@ CAPTURES = (
         "written by rosbags",
         "",
         "https://docs.ros.org/en/api/sensor_msgs/html/index-msg.html",
-        _lazy("ros.find"),
-        _lazy("ros.read"),
+        partial(_call, "ros.find"),
+        partial(_call, "ros.read"),
         (".bag", ".mcap", ".db3"),
     ),
     # which the reader of ROS opens
@@ -207,9 +202,9 @@ CAPTURES = (
         "written by its format; a real device's calibration gives its SDK's own numbers",
         "flying pixels, noise on dark surfaces, rounded corners",
         "https://github.com/microsoft/Azure-Kinect-Sensor-SDK/tree/develop/src/record",
-        of_file=_lazy("kinect.read"),
+        of_file=partial(_call, "kinect.read"),
         suffixes=(".mkv",),
-        is_ours=_lazy("kinect.is_ours"),
+        is_ours=partial(_call, "kinect.is_ours"),
     ),
     Capture(
         "HEIC photos with depth",
@@ -219,9 +214,9 @@ CAPTURES = (
         "a real iPhone photo",
         "256 steps; of two lenses or a network: guesses on blank walls, hair and glass, mostly no true distances",
         "https://developer.apple.com/documentation/avfoundation/avdepthdata",
-        of_file=_lazy("heic.read"),
+        of_file=partial(_call, "heic.read"),
         suffixes=(".heic", ".heif"),
-        is_ours=_lazy("heic.has_depth"),
+        is_ours=partial(_call, "heic.has_depth"),
     ),
     Capture(
         "COLMAP",
@@ -277,7 +272,7 @@ CAPTURES = (
 CAPTURE_FILES = (*dict.fromkeys(suffix for each in CAPTURES for suffix in each.suffixes), ".zip")
 
 
-@functools.cache
+@cache
 def all_captures() -> tuple[Capture, ...]:
     """Return the captures in the order of asking, those of other packages first."""
     others = []
@@ -294,6 +289,9 @@ def find_capture(place: Path) -> PairingResult | None:
 
 def lacking(folder: Path) -> list[str]:
     """Return the captures that a folder resembles, each with its missing files: ``like ScanNet, without depth/``."""
-    return [
-        f"like {each.name}, without {', '.join(missing)}" for each in all_captures() if (missing := each.lacks(folder))
-    ]
+    found = []
+    for each in all_captures():
+        if has_any(folder, each.marks):
+            missing = [part for part in each.needs if not has_any(folder, part.split(" or "))]
+            found += [f"like {each.name}, without {', '.join(missing)}"] if missing else []
+    return found

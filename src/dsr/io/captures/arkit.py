@@ -50,7 +50,12 @@ def find_arkitscenes(folder: Path) -> PairingResult | None:
         return None
     photos = {path.stem: path for path in sorted((folder / kind).glob("*.png"), key=natural_key)}
     trajectory = folder / "lowres_wide.traj"
-    motions = _read_trajectory(trajectory)
+    motions: dict[float, _Motion] = {}  # rotation and translation by time
+    for number, line in enumerate(read_text(trajectory).splitlines() if trajectory.is_file() else (), 1):
+        values = numbers_in(line.split())
+        if len(values) != 7 or not math.isfinite(values[0]):
+            raise ValueError(f"{trajectory}: line {number}: expected 7 numbers, got {line!r:.80}")
+        motions[values[0]] = tuple(values[1:])
     times = np.array([*motions])
     both, unpaired = paired(photos, depths)
     pairs = []
@@ -68,17 +73,6 @@ def find_arkitscenes(folder: Path) -> PairingResult | None:
     text = f"a video of {_ARKITSCENES}, photos of {kind}"
     note = describe_capture(text, "millimetres", pairs, poses=bool(motions))
     return PairingResult(tuple(pairs), (note,), unpaired)
-
-
-def _read_trajectory(path: Path) -> dict[float, _Motion]:
-    """Return rotation and translation by time; empty without the file."""
-    motions: dict[float, _Motion] = {}
-    for number, line in enumerate(read_text(path).splitlines() if path.is_file() else (), 1):
-        values = numbers_in(line.split())
-        if len(values) != 7 or not math.isfinite(values[0]):
-            raise ValueError(f"{path}: line {number}: expected 7 numbers, got {line!r:.80}")
-        motions[values[0]] = tuple(values[1:])
-    return motions
 
 
 def _time(stem: str) -> float:

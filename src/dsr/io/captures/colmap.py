@@ -226,7 +226,8 @@ class _SparseDepth(Source):
         depth = np.full(size, np.nan, np.float32)
         if not len(seen):
             return depth
-        pose = _pose(str(self.file), self.image.quaternion, self.image.translation)
+        w, *xyz = self.image.quaternion
+        pose = from_quaternion(self.image.translation, (*xyz, w), str(self.file))  # from world to camera
         columns, rows, _ = seen.T
         z = places @ pose[2, :3] + pose[2, 3]
         inside = (z > 0) & (columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)
@@ -252,13 +253,9 @@ def _geometry(place: str, quaternion: Sequence[float], translation: Sequence[flo
         count = next(each for each in counts if each >= len(bends))
         with naming(place):
             lens = Lens(name, (*bends, *[0.0] * (count - len(bends))))
-    return Geometry(found, invert(_pose(place, quaternion, translation)), lens=lens if lens and lens.bends else None)
-
-
-def _pose(place: str, quaternion: Sequence[float], translation: Sequence[float]) -> np.ndarray:
-    """Return the transform from world to camera, (4, 4)."""
-    w, x, y, z = quaternion
-    return from_quaternion(translation, (x, y, z, w), place)
+    w, *xyz = quaternion
+    to_camera = from_quaternion(translation, (*xyz, w), place)
+    return Geometry(found, invert(to_camera), lens=lens if lens and lens.bends else None)
 
 
 @dataclass
@@ -273,12 +270,6 @@ class _Bytes:
         found = struct.unpack_from(f"<{layout}", self.content, self.place)
         self.place += struct.calcsize(f"<{layout}")
         return found
-
-    def text(self) -> str:
-        """Return the next text, which ends with a 0."""
-        length = self.content.find(b"\0", self.place) - self.place
-        found, _ = self.read(f"{length}sc")
-        return str(found.decode("utf-8", "replace"))
 
 
 def _checked(
@@ -312,12 +303,14 @@ def _images_of_bytes(_path: Path, content: bytes) -> list[_Image]:
     file, images = _Bytes(content), []
     for _ in range(*file.read("Q")):
         _, *numbers, camera = file.read("I7dI")
-        name, (count,) = file.text(), file.read("Q")
+        length = content.find(b"\0", file.place) - file.place  # of the name
+        (name, _), (count,) = file.read(f"{length}sc"), file.read("Q")
         (observations,) = file.read(f"{24 * count}s")
         stored = np.frombuffer(observations, [("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
         points = np.where(stored["point"] == _NONE, -1.0, stored["point"].astype(np.float64))
         observed = np.stack((stored["x"], stored["y"], points), axis=1)
-        images.append(_Image(name, tuple(numbers[:4]), tuple(numbers[4:]), camera, observed))
+        text = name.decode("utf-8", "replace")
+        images.append(_Image(text, tuple(numbers[:4]), tuple(numbers[4:]), camera, observed))
     return images
 
 

@@ -67,12 +67,6 @@ class Capture:
 
         return join({path.stem: of_file(path) for path in files})
 
-    def lacks(self, folder: Path) -> list[str]:
-        """Return the missing parts of a folder that looks like this capture; nothing if it does not."""
-        if not _has(folder, self.marks):
-            return []
-        return [part for part in self.needs if not _has(folder, part.split(" or "))]
-
     def rows(self) -> dict[str, str]:
         """Return the description, text by label, the name first; empty texts are left out."""
         texts = {"": self.name, "export": self.export, "found by": self.found_by, "read": self.read,
@@ -89,7 +83,7 @@ def has_name(folder: Path, first: str, last: str) -> bool:
         return any(entry.name.startswith(first) and entry.name.endswith(last) for entry in entries)
 
 
-def _has(folder: Path, patterns: Iterable[str]) -> bool:
+def has_any(folder: Path, patterns: Iterable[str]) -> bool:
     """Return whether a folder has a file or folder of one of several patterns."""
     for pattern in patterns:
         parent, name = folder / Path(pattern).parent, Path(pattern).name

@@ -12,7 +12,7 @@ import functools
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -44,7 +44,19 @@ class _HeicImage(Source):
         maps = [each for each in open_heic(self.file).info.get("depth_images", ()) if each is not None]
         if not maps:
             raise ValueError(f"{self.file}: expected a depth map of the photo, there is none that can be read")
-        return _read_depth(self.file, maps[0])
+        values, metadata = decode_heic(self.file, maps[0]), maps[0].info["metadata"] or {}
+        kind = metadata.get("representation_type")
+        names = ("d_min", "d_max") if kind == _DISPARITY else ("z_near", "z_far")
+        if kind not in (_INVERSE_DEPTH, _DISPARITY, _DEPTH) or not all(name in metadata for name in names):
+            raise ValueError(f"{self.file}: expected a depth map with the range of its values, got {metadata!s:.120}")
+        low, high = (float(metadata[name]) for name in names)
+        share = values.astype(np.float64) / np.iinfo(values.dtype).max
+        with np.errstate(all="ignore"):
+            if kind == _INVERSE_DEPTH:
+                low, high = (float(np.divide(1, each)) for each in (high, low))
+            mapped = low + share * (high - low)
+            depth = mapped if kind == _DEPTH else 1 / mapped
+        return np.where(np.isfinite(depth) & (depth > 0), depth, np.nan).astype(np.float32)
 
     def record(self) -> Record:
         """Return the file's name and hash."""
@@ -69,23 +81,6 @@ def has_depth(path: Path) -> bool:
     """Return whether a file lists a depth map."""
     with opened(path) as file:
         return _MARK.search(file.read(_HEAD)) is not None
-
-
-def _read_depth(path: Path, stored: Any) -> np.ndarray:
-    """Return depth in metres, (h, w) float32, NaN where it is none."""
-    values, metadata = decode_heic(path, stored), stored.info["metadata"] or {}
-    kind = metadata.get("representation_type")
-    names = ("d_min", "d_max") if kind == _DISPARITY else ("z_near", "z_far")
-    if kind not in (_INVERSE_DEPTH, _DISPARITY, _DEPTH) or not all(name in metadata for name in names):
-        raise ValueError(f"{path}: expected a depth map with the range of its values, got {metadata!s:.120}")
-    low, high = (float(metadata[name]) for name in names)
-    share = values.astype(np.float64) / np.iinfo(values.dtype).max
-    with np.errstate(all="ignore"):
-        if kind == _INVERSE_DEPTH:
-            low, high = (float(np.divide(1, each)) for each in (high, low))
-        mapped = low + share * (high - low)
-        depth = mapped if kind == _DEPTH else 1 / mapped
-    return np.where(np.isfinite(depth) & (depth > 0), depth, np.nan).astype(np.float32)
 
 
 def _geometry(path: Path, xmp: bytes, size: Size) -> Geometry:

@@ -70,7 +70,7 @@ def find(folder: Path) -> PairingResult | None:
         "conf": numbered_files(folder / "conf", (".exr", ".png")),
     }
     metadata = parse_model(_Metadata, content, path, f"expected {_APP}'s metadata; ")
-    return _frames(path, metadata, files, lambda *_: None)
+    return _frames(path, metadata, files, {})
 
 
 def read_archive(path: Path) -> PairingResult:
@@ -88,22 +88,22 @@ def read_archive(path: Path) -> PairingResult:
         "depth": functools.partial(decode_lzfse, size=size, dtype="<f4"),
         "conf": functools.partial(decode_lzfse, size=size, dtype="u1"),
     }
-
-    def part(kind: str, number: int) -> Part:
-        name, most = f"rgbd/{files[kind][number].name}", 4 * size[0] * size[1] + (1 << 16)
-        fetch = functools.partial(read_part, path, name, PHOTO_LIMIT if kind == "jpg" else most)
-        return Part(path, name, fetch, decoders[kind])
-
-    found = _frames(place, metadata, files, part)
+    parts = {}
+    for kind, numbered in files.items():
+        most = PHOTO_LIMIT if kind == "jpg" else 4 * size[0] * size[1] + (1 << 16)
+        for file in numbered.values():
+            name = f"rgbd/{file.name}"
+            parts[file] = Part(path, name, functools.partial(read_part, path, name, most), decoders[kind])
+    found = _frames(place, metadata, files, parts)
     if not found.pairs:
         raise ValueError(f"{path}: expected photos and depth maps of {_APP} in rgbd/, found no pair")
     return found
 
 
 def _frames(
-    path: Path, metadata: _Metadata, files: Mapping[str, Mapping[int, Path]], part: Callable[[str, int], Part | None]
+    path: Path, metadata: _Metadata, files: Mapping[str, Mapping[int, Path]], parts: Mapping[Path, Part]
 ) -> PairingResult:
-    """Return the frames of files by kind and number, each in a part of an archive if it is no file of its own."""
+    """Return the frames of files by kind and number; those that are no files of their own are parts of an archive."""
     both, unpaired = paired(files["jpg"], files["depth"])
     size, K, poses = (metadata.h, metadata.w), metadata.K, metadata.poses
     moves = len(poses) == 1 or any(pose != poses[0] for pose in poses)
@@ -113,11 +113,11 @@ def _frames(
         pose = poses[number] if moves and number < len(poses) else None
         content = repr((size, own or [K[0], K[4], K[6], K[7]], pose)).encode()
         geometry = stated(_geometry, f"{path}: frame {number}", metadata, own, pose)
-        frame = CaptureFrame(_APP, geometry, path, content, part("jpg", number), part("depth", number))
+        photo, depth = files["jpg"][number], files["depth"][number]
+        frame = CaptureFrame(_APP, geometry, path, content, parts.get(photo), parts.get(depth))
         known = files["conf"].get(number)
-        confidence = None if known is None else ConfidenceMap(known, HIGHEST_LEVEL, part("conf", number))
-        places = files["jpg"][number], files["depth"][number]
-        pairs.append(Pair(f"{number:06}", *places, unit=1.0, capture=frame, confidence=confidence))
+        confidence = None if known is None else ConfidenceMap(known, HIGHEST_LEVEL, parts.get(known))
+        pairs.append(Pair(f"{number:06}", photo, depth, unit=1.0, capture=frame, confidence=confidence))
     notes = [describe_capture(f"a capture of {_APP}", "metres", pairs, poses=moves)]
     if poses and not moves:
         notes.append(Assumption("no poses: those of the capture are all the same"))
