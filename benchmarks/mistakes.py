@@ -192,7 +192,6 @@ def scalar_first(turn: Matrix) -> Matrix:
 
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-FORWARD_DOWN = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
 RIGHT = "right"

@@ -66,8 +66,7 @@ def view(request: ViewRequest, console: Console) -> list[str]:
     largest, factors = max(each.vertices for each in packed), sorted({each.about["after"]["factor"] for each in packed})
     reduced = "" if factors == [1] else f", maps reduced by {' or '.join(map(str, factors))} each way"
     size = megabytes(page.stat().st_size)
-    count = "1 result" if len(packed) == 1 else f"{len(packed)} results"
-    show(console, f"{count}, at most {largest:,} vertices each{reduced}, {size} -> {page}")
+    show(console, f"{_count(packed)}, at most {largest:,} vertices each{reduced}, {size} -> {page}")
     if request.open_page and not webbrowser.open(page.resolve().as_uri()):
         show(console, "there is no browser to open it with; open it yourself, or copy it to where there is one")
     return problems
@@ -126,11 +125,14 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
     comment = world_comment(ups.pop() if len(ups) == 1 else "")
     write_ply(request.output, mesh.vertices, colours, mesh.normals, mesh.faces, frame=comment)
     size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, voxels of {show_length(voxel)}"
-    count = "1 result" if len(frames) == 1 else f"{len(frames)} results"
-    show(console, f"{count} -> {request.output}: {size}; in the world's frame of the poses")
+    show(console, f"{_count(frames)} -> {request.output}: {size}; in the world's frame of the poses")
     if request.score:
         show(console, f"successive results differ by {_difference(frames, max_error)} (OPW)")
     return problems
+
+
+def _count(results: Sequence[object]) -> str:
+    return "1 result" if len(results) == 1 else f"{len(results)} results"
 
 
 def _difference(frames: Sequence[Path], max_error: float) -> str:

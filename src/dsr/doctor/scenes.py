@@ -330,16 +330,18 @@ def find_rounding(scene: Scene) -> Rounding | None:
 def find_repetition(depth: Array) -> int:
     """Return the factor by which a map was enlarged by repeating pixels, 1 for a map that was not."""
     for factor in _REPEATED:
-        in_phase = True  # values along all lines change only at every ``factor``-th pixel
-        for lines in (depth, depth.T):
-            change = np.diff(lines)
-            counts = (np.isfinite(change) & (change != 0)).sum(axis=0)
-            phases = np.bincount(np.arange(counts.size) % factor, counts, minlength=factor)
-            everywhere = np.count_nonzero(counts) > 0.5 * counts.size / factor
-            in_phase &= bool(everywhere and phases.sum() >= _LEAST and phases.max() > 0.99 * phases.sum())
-        if in_phase:
+        if all(_in_phase(lines, factor) for lines in (depth, depth.T)):
             return factor
     return 1
+
+
+def _in_phase(lines: Array, factor: int) -> bool:
+    """Return whether values along the lines change only at every ``factor``-th pixel."""
+    change = np.diff(lines)
+    counts = (np.isfinite(change) & (change != 0)).sum(axis=0)
+    phases = np.bincount(np.arange(counts.size) % factor, counts, minlength=factor)
+    everywhere = np.count_nonzero(counts) > 0.5 * counts.size / factor
+    return bool(everywhere and phases.sum() >= _LEAST and phases.max() > 0.99 * phases.sum())
 
 
 def _unit(values: Array) -> float:

@@ -10,7 +10,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -29,6 +29,7 @@ from dsr.utils.files import replacing, write_text
 from dsr.utils.guards import pixels_beside, refusing
 from dsr.utils.versions import how_to_install
 
+_Value = TypeVar("_Value")
 RGBD = ("color.png", "depth.png", "intrinsic.json")
 _MILLIMETRES, _STEPS = 1000, 65535  # of a metre, and of 16 bits
 _POINTS = 100_000  # of all frames together, from which an optimisation starts
@@ -76,6 +77,11 @@ def parse_pose(where: str, value: object) -> Tensor | None:
         return None
     with refusing(f"{where}: expected a rigid transform of 4 x 4 numbers, got {value}", TypeError, ValueError):
         return torch.from_numpy(check_pose(where, np.array(value, dtype=np.float64)))
+
+
+def _common(values: Sequence[_Value]) -> _Value | None:
+    """Return what all frames have, or None if they differ."""
+    return values[0] if len(set(values)) == 1 else None
 
 
 def to_millimetres(depth: np.ndarray) -> tuple[np.ndarray, int]:
@@ -133,8 +139,8 @@ def write_open3d(folder: Path, frames: Sequence[Frame]) -> list[Path]:
         rows.append(f"{number} {number} {number + 1}\n")
         rows += (" ".join(f"{value:.12g}" for value in row) + "\n" for row in frame.matrix)
     cameras = {f"intrinsics/{frame.stem}.json": frame.camera for frame in frames}
-    if len({frame.camera for frame in frames}) == 1:
-        cameras = {RGBD[2]: frames[0].camera}
+    if (camera := _common([frame.camera for frame in frames])) is not None:
+        cameras = {RGBD[2]: camera}
     for name, each in cameras.items():
         files.append(folder / name)
         _write_intrinsics(files[-1], each)
@@ -161,11 +167,9 @@ def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
     millimetres by default; ``depth_unit_scale_factor`` states it for other readers.
     """
     expect_poses("nerfstudio", {frame.name: frame.pose is not None for frame in frames})
-    camera = frames[0].camera if len({frame.camera for frame in frames}) == 1 else None  # of all frames
-    up = frames[0].up if len({frame.up for frame in frames}) == 1 else ""
-    folder = path.parent / "nerfstudio"
+    camera, folder = _common([frame.camera for frame in frames]), path.parent / "nerfstudio"
     points = folder / "points.ply"
-    write_ply(points, *_sparse(frames), frame=world_comment(up))
+    write_ply(points, *_sparse(frames), frame=world_comment(_common([frame.up for frame in frames]) or ""))
     files, entries = list[Path](), list[dict[str, Any]]()
     for frame in frames:
         pictures = _write_pictures(folder, ("images", "depths"), frame, to_millimetres(frame.read_depth())[0])
@@ -276,8 +280,7 @@ def write_rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:
     recording = rerun.RecordingStream("dsr")
     with replacing(path) as temporary:
         recording.save(str(temporary))
-        up = frames[0].up if len({frame.up for frame in frames}) == 1 else ""
-        axes = {"": "RDF", "y": "RUB", "z": "RFU"}[up]
+        axes = {"": "RDF", "y": "RUB", "z": "RFU"}[_common([frame.up for frame in frames]) or ""]
         recording.log("/", getattr(rerun.ViewCoordinates, axes), static=True)
         timed = all(frame.time is not None for frame in frames)
         for number, frame in enumerate(frames):

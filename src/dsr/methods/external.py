@@ -112,7 +112,7 @@ class External(Method):
 
     def describe(self, sample: DepthSample) -> str:
         """Return a note on the scene's map if its format costs precision, or if it was changed."""
-        notes = [f"{self._fit} fitted to the low-resolution map"] if self._fit else []
+        notes = [describe_fit(self._fit)] if self._fit else []
         _, found = self._find(sample.dataset, sample.scene, sample.scale)
         if len(found) == 1:
             stored = read_depth_file(found[0], pixels_beside(sample.camera.height, sample.camera.width))
@@ -167,6 +167,11 @@ class External(Method):
         factor = size[1] / values.shape[-1] if self._quantity == "disparity" else 1.0  # in pixels of the photo
         mode = "nearest-exact" if self._resize == "nearest" else self._resize
         return interpolate(values[None], size, mode=mode)[0] * factor
+
+
+def describe_fit(fit: str | None) -> str:
+    """Return the note on a fitted map that is shown beside its scores; empty without a fit."""
+    return f"{fit} fitted to the low-resolution map" if fit else ""
 
 
 def fit_to_map(values: Tensor, sample: DepthSample, quantity: str, fit: str, place: Path) -> Tensor:

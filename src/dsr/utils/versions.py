@@ -50,24 +50,23 @@ def versions() -> dict[str, Any]:
     """Return the versions of packages, Python and the project's checkout, the accelerator and the number of threads."""
     import torch  # noqa: PLC0415
 
-    answers: list[str | None] = []
-    for arguments in (("rev-parse", "HEAD"), ("status", "--porcelain", "--untracked-files=no")):
-        command = ["git", "-C", str(Path(__file__).parent), *arguments]
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)  # noqa: S603
-            answers.append(done.stdout.strip())
-        except (OSError, subprocess.SubprocessError):
-            answers.append(None)
-    commit, changes = answers
     return {
         "packages": package_versions(),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "git_commit": commit,
-        "git_dirty": bool(changes),
+        "git_commit": _git("rev-parse", "HEAD"),
+        "git_dirty": bool(_git("status", "--porcelain", "--untracked-files=no")),
         "accelerator": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "cpu_threads": torch.get_num_threads(),
     }
+
+
+def _git(*arguments: str) -> str | None:
+    command = ["git", "-C", str(Path(__file__).parent), *arguments]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()  # noqa: S603
+    except (OSError, subprocess.SubprocessError):
+        return None
 
 
 def file_hash(path: Path, progress: Task = lambda *_: None) -> str:

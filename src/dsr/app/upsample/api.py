@@ -186,8 +186,7 @@ class Upsampler:
         """
         with python_messages():
             picture = without_repeats(picture_of(rgb, depth, camera, mask=mask, unit=unit))
-            given = cast("Any", depth)
-            return self._upsample(picture, given.device if isinstance(given, Tensor) else None, progress=progress)
+            return self._upsample(picture, _device_of(depth), progress=progress)
 
     def stream(
         self, frames: Iterable[tuple[Any, ...]], *, neighbours: int = 4, unit: str | float | None = None
@@ -304,6 +303,11 @@ def _is_empty(picture: Picture) -> bool:
     return bool(picture.depth_lr.isnan().all())
 
 
+def _device_of(depth: Any) -> torch.device | None:
+    """Return the device of a depth map that was given as a tensor."""
+    return depth.device if isinstance(depth, Tensor) else None
+
+
 def _read_frame(frame: Any, number: int, unit: str | float | None) -> tuple[Picture, torch.device | None]:
     """Return a frame of a stream, and the device of its depth if that is a tensor."""
     with naming(f"frame {number}"), python_messages():
@@ -312,5 +316,4 @@ def _read_frame(frame: Any, number: int, unit: str | float | None) -> tuple[Pict
             raise ValueError(f"expected (rgb, depth, camera) or (rgb, depth, camera, pose), got {came}")
         rgb, depth, camera, pose = (*frame, None)[:4]
         picture = picture_of(rgb, depth, camera, unit=unit, pose=pose, empty=True)
-        device = depth.device if isinstance(depth, Tensor) else None
-        return picture if _is_empty(picture) else without_repeats(picture), device
+        return picture if _is_empty(picture) else without_repeats(picture), _device_of(depth)

@@ -226,8 +226,7 @@ class _SparseDepth(Source):
         depth = np.full(size, np.nan, np.float32)
         if not len(seen):
             return depth
-        w, *xyz = self.image.quaternion
-        pose = from_quaternion(self.image.translation, (*xyz, w), str(self.file))  # from world to camera
+        pose = _pose(str(self.file), self.image.quaternion, self.image.translation)
         columns, rows, _ = seen.T
         z = places @ pose[2, :3] + pose[2, 3]
         inside = (z > 0) & (columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)
@@ -253,9 +252,13 @@ def _geometry(place: str, quaternion: Sequence[float], translation: Sequence[flo
         count = next(each for each in counts if each >= len(bends))
         with naming(place):
             lens = Lens(name, (*bends, *[0.0] * (count - len(bends))))
+    return Geometry(found, invert(_pose(place, quaternion, translation)), lens=lens if lens and lens.bends else None)
+
+
+def _pose(place: str, quaternion: Sequence[float], translation: Sequence[float]) -> np.ndarray:
+    """Return the transform from world to camera, (4, 4)."""
     w, *xyz = quaternion
-    to_camera = from_quaternion(translation, (*xyz, w), place)
-    return Geometry(found, invert(to_camera), lens=lens if lens and lens.bends else None)
+    return from_quaternion(translation, (*xyz, w), place)
 
 
 @dataclass

@@ -73,8 +73,7 @@ def read(reader: Any, path: Path) -> PairingResult:
     except ValueError as error:  # which does not matter where cameras are given
         geometry = Geometry(damage=str(error))
     device = _device(reader)
-    transforms = [each.topic for each in reader.connections if "/tf/" in each.topic]
-    apart = all(any(topic.startswith(f"{each['stream']}/tf/") for topic in transforms) for each in (color, depth))
+    apart = all(_transforms(reader, each["stream"]) for each in (color, depth))
     frame = CaptureFrame(device, geometry, path, repr(streams or geometry.damage).encode(), apart=apart)
     found = pair_by_time(_shots(reader, path, color), _shots(reader, path, depth), frame, unit)
     about = describe_capture(f"a recording of {device}", f"units of {show_length(unit)}", found.pairs, poses=False)
@@ -127,9 +126,14 @@ def _stream(reader: Any, path: Path, stream: str) -> _Stream:
     return _Stream(camera, lens, reference, transform, notes)
 
 
+def _transforms(reader: Any, stream: str) -> list[str]:
+    """Return the topics of a stream's transforms."""
+    return sorted(each.topic for each in reader.connections if each.topic.startswith(f"{stream}/tf/"))
+
+
 def _transform(reader: Any, place: str, stream: str) -> tuple[str, Matrix | None]:
     """Return the number of a stream's frame of reference, and the transform from there; None if there is none."""
-    for topic in sorted(each.topic for each in reader.connections if each.topic.startswith(f"{stream}/tf/")):
+    for topic in _transforms(reader, stream):
         message = first_message(reader, topic)
         if message is None:
             continue

@@ -219,10 +219,8 @@ class ShadingSolver:
         directed = torch.einsum("bck,bkhw->bchw", light, n)
         residual = self.albedo * (directed + self.lighting[..., 3, None, None]) - self.problem.rgb
         by_m = (light[..., None, None] - directed[:, :, None] * n[:, None]) * (self.albedo / size)[:, :, None]
-        slopes, stretch = (  # derivatives by theta of the residual, (B, C, 3, H, W), and of |m|, (B, 3, H, W)
-            torch.stack((along_u - rays[0, 0] * ahead, along_v - rays[0, 1] * ahead, -ahead), dim=-3)
-            for along_u, along_v, ahead in (by_m.unbind(dim=-3), n.unbind(dim=-3))
-        )
+        slopes = _chain_to_theta(by_m, rays)  # the derivatives of the residual, (B, C, 3, H, W)
+        stretch = _chain_to_theta(n, rays)  # those of |m|
 
         depth = theta[:, 2:]
         gradient = (residual[:, :, None] * slopes).sum(dim=1) + area_weight * depth.abs() * stretch
@@ -251,6 +249,12 @@ class ShadingSolver:
         shaded = 0.5 * float((self._weight * (albedo * shading - self.problem.rgb).square()).sum())
         length = 0 if regions is None else boundary_length(regions, self.problem.inside)
         return shaded, self.problem.boundary_weight * length
+
+
+def _chain_to_theta(by_m: Tensor, rays: Tensor) -> Tensor:
+    """Convert derivatives by m to derivatives by theta, (..., 3, H, W)."""
+    along_u, along_v, ahead = by_m.unbind(dim=-3)
+    return torch.stack((along_u - rays[0, 0] * ahead, along_v - rays[0, 1] * ahead, -ahead), dim=-3)
 
 
 def _solve(gradient: Tensor, hessian: Tensor, damping: Tensor) -> Tensor:

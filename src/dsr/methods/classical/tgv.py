@@ -150,10 +150,8 @@ class TotalGeneralisedVariation(Method):
             prox_v = v + step_v * (gp[:, :, 0] + divergence(q))
             ahead_u, ahead_v = 2 * prox_u - u, 2 * prox_v - v
             bent = g.times(_zero_border(gradient(ahead_u) - ahead_v[:, :, None]))
-            prox_p, prox_q = (  # each pixel's vector or matrix, projected onto the ball of a radius
-                each / (each.square().sum(dim=(1, 2), keepdim=True).sqrt() / radius).clamp(min=1)
-                for each, radius in ((p + step_p * bent, self.first), (q + step_q * gradient(ahead_v), self.second))
-            )
+            prox_p = _project_ball(p + step_p * bent, self.first)
+            prox_q = _project_ball(q + step_q * gradient(ahead_v), self.second)
             u, v = u.lerp(prox_u, _RELAXATION), v.lerp(prox_v, _RELAXATION)
             p, q = p.lerp(prox_p, _RELAXATION), q.lerp(prox_q, _RELAXATION)
             since = (done - 1) % _CHECK_EVERY + 1
@@ -227,3 +225,9 @@ def _zero_border(p: Tensor) -> Tensor:
     p[:, 0, ..., -1] = 0
     p[:, 1, ..., -1, :] = 0
     return p
+
+
+def _project_ball(p: Tensor, radius: float) -> Tensor:
+    """Project each pixel's vector or matrix of (B, 2, C, H, W) onto the ball of a radius."""
+    lengths = p.square().sum(dim=(1, 2), keepdim=True).sqrt()
+    return p / (lengths / radius).clamp(min=1)

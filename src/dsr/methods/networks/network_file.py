@@ -22,7 +22,7 @@ from torch.nn import functional
 
 from dsr.geometry.camera import RANGE_TYPES
 from dsr.methods.base import Abilities, Cost, Method
-from dsr.methods.external import QUANTITIES, Fit, fit_to_map, from_depth, to_depth, within_limits
+from dsr.methods.external import QUANTITIES, Fit, describe_fit, fit_to_map, from_depth, to_depth, within_limits
 from dsr.methods.images import grey, inpaint, normalise, normalise_imagenet, pad_to_multiple, resize_bicubic
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.network import DisparityNetwork
@@ -156,7 +156,7 @@ class NetworkFile(Method):
 
     def describe(self, sample: DepthSample) -> str:
         """Return how the result was fitted."""
-        return f"{self._fit} fitted to the low-resolution map" if self._fit else ""
+        return describe_fit(self._fit)
 
     def content(self, dataset: str, scene: str, scale: float) -> str:
         """Return the SHA-256 of the network's file, and of those that hold its weights."""

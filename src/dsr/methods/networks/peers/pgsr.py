@@ -100,12 +100,10 @@ class _Interaction(nn.Module):
         # -1 and 1 at the centres of the border pixels
         down, across = (torch.linspace(-1, 1, n, dtype=offset.dtype, device=offset.device) for n in offset.shape[-2:])
         places = torch.stack(torch.meshgrid(across, down, indexing="xy"), dim=-1)[None]  # (1, h, w, 2)
-        moved = (places + offset.movedim(1, -1)).clamp(-1, 1)
         for _ in range(_STEPS):
-            offset = offset + functional.grid_sample(offset, moved, align_corners=True)
-            moved = (places + offset.movedim(1, -1)).clamp(-1, 1)
+            offset = offset + functional.grid_sample(offset, _move(places, offset), align_corners=True)
         planes = _normalise(self.conv_parameterized_depth(photo))
-        others = functional.grid_sample(planes, moved, padding_mode="border", align_corners=True)
+        others = functional.grid_sample(planes, _move(places, offset), padding_mode="border", align_corners=True)
         estimate = torch.lerp(_evaluate(planes), _evaluate(others), confidence)
         mapped = _apply(self.conv_depthMapping, depth)
         return self.conv_fusion(torch.cat((mapped, _apply(self.conv_depth2feature, estimate)), dim=1))
@@ -160,6 +158,11 @@ def _head(hidden: int, after: int) -> nn.Sequential:
 def _apply(layer: nn.Module, *inputs: Tensor) -> Tensor:
     """Return a convolution of the inputs' channels, followed by a leaky ReLU."""
     return functional.leaky_relu_(layer(torch.cat(inputs, dim=1)), _SLOPE)
+
+
+def _move(places: Tensor, offset: Tensor) -> Tensor:
+    """Return positions, (1, h, w, 2), moved by (B, 2, h, w)."""
+    return (places + offset.movedim(1, -1)).clamp(-1, 1)
 
 
 def _normalise(planes: Tensor) -> Tensor:
