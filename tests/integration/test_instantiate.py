@@ -7,6 +7,7 @@ from typing import Any
 import lightning
 import pytest
 import torch
+from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import Callback, EarlyStopping
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
@@ -89,7 +90,8 @@ def test_optimisers_schedules_callbacks_and_loggers_are_nodes(tmp_path: Path) ->
     assert isinstance(loggers[1], CSVLogger)
 
 
-def test_composed_configuration_names_its_choices() -> None:
+def test_composed_configuration_names_its_choices(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", None)  # as in a process without a command
     config = dsr.compose("train", ["model=facets", "dataset=folder", "dataset.root=here"])
     assert (config.names.model, config.names.dataset, config.names.optimizer) == ("facets", "folder", "adamw")
     assert TrainConfig.of(plain_config(config)).names == config.names
