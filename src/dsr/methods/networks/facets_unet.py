@@ -336,15 +336,18 @@ def _lr_input(around: Stencil, weight: Tensor, noise: Tensor, hints: Tensor) -> 
 def _project(result: Tensor, values: Tensor, known: Tensor, gate: Tensor, kernels: Sequence[str | None]) -> Tensor:
     """Return results closer to what was measured, where the kernel is known."""
     scale = result.shape[-1] // values.shape[-1]
-    for kernel in dict.fromkeys(filter(None, kernels)):
-        places = [i for i, each in enumerate(kernels) if each == kernel]
-        index = None if len(places) == len(kernels) else _constant(tuple(places), torch.int64, result.device)
-        x, given, valid, factor = (each if index is None else each[index] for each in (result, values, known, gate))
-        model = Downsampling(kernel)  # type: ignore[arg-type]
-        for _ in range(_PROJECTIONS):
-            residual = torch.where(valid, given - model(x, scale, complete=True), 0)
-            x = x + factor.to(x.dtype) * upsample_bicubic(residual, scale)
-        result = x if index is None else result.index_copy(0, index, x)
+    places = {kernel: [i for i, each in enumerate(kernels) if each == kernel] for kernel in kernels if kernel}
+    for _ in range(_PROJECTIONS if places else 0):
+        seen = values  # so that nothing is left over where the kernel is not known
+        for kernel, images in places.items():
+            model = Downsampling(kernel)  # type: ignore[arg-type]
+            if len(images) == len(kernels):
+                seen = model(result, scale, complete=True)
+            else:
+                index = _constant(tuple(images), torch.int64, result.device)
+                seen = seen.index_copy(0, index, model(result[index], scale, complete=True))
+        residual = torch.where(known, values - seen, 0)
+        result = result + gate.to(result.dtype) * upsample_bicubic(residual, scale)
     return result
 
 
