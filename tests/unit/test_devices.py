@@ -3,6 +3,7 @@
 The results have to be those of the CPU. ``DSR_DEVICE=cuda`` runs the same tests on a real GPU.
 """
 
+import contextlib
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -13,6 +14,8 @@ from pretend_cuda import pretend_cuda
 from small_lpips import random_lpips
 from small_scenes import sample_of
 from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_flatten
 from torch.utils.data import default_collate
 
 from dsr.degradation.downsampling import Downsampling, make_sample
@@ -20,6 +23,7 @@ from dsr.degradation.holes import Blobs, Shadows
 from dsr.degradation.noise import GaussianMultiplicative, Kinect, TimeOfFlight
 from dsr.degradation.random_degradation import Everything
 from dsr.inference import upsample_surface
+from dsr.methods.dip.upsampler import DeepImagePrior, PriorOptimisation
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.metrics import evalmde
@@ -140,6 +144,71 @@ def test_training_step_on_a_gpu_is_that_of_the_cpu(model, gpu):
         means = compute_means(module.metrics[0])
         found.append([float(each.detach()) for each in (loss, norm, *means.values())])
     np.testing.assert_allclose(found[1], found[0], rtol=1e-3)
+
+
+class _Operations(TorchDispatchMode):
+    """Counts operations that launch something, and notes those that a GPU's queue would have to be waited for."""
+
+    def __init__(self):
+        super().__init__()
+        self.count, self.waits = 0, []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.count += not func.is_view
+        tensors = [each for each in tree_flatten((args, kwargs or {}))[0] if isinstance(each, torch.Tensor)]
+        name = func.overloadpacket.__name__
+        if name in ("_local_scalar_dense", "nonzero") or any(each.device.type == "cpu" for each in tensors):
+            self.waits.append(name)
+        return func(*args, **(kwargs or {}))
+
+
+def test_step_of_facets_waits_for_no_gpu_and_takes_as_many_operations_for_any_batch():
+    sample, degradation = _sample(64), Degradation(4, Downsampling("box"))
+    scene, counts = Scene("set", "hall", sample.rgb, sample.camera, sample.depth), []
+    patches = Patches([[scene]], PatchSettings(patch=32), degradation, everything=Everything())
+    with pretend_cuda() as gpu:
+        module = SuperResolution(FacetsUNet(4, width=8, deep=8), SurfaceObjective()).to(gpu)
+        optimizer = torch.optim.AdamW(module.net.parameters(), fused=True)
+        for size in (1, 6):
+            batch = module.net.prepare(default_collate([patches[number] for number in range(size)]))
+            moved = {key: value.to(gpu) if isinstance(value, torch.Tensor) else value for key, value in batch.items()}
+            for warm in (False, True):
+                operations = _Operations()
+                with operations if warm else contextlib.nullcontext():
+                    module.loss_terms(moved)["loss"].backward()
+                    optimizer.step()
+                    optimizer.zero_grad()
+            counts.append(operations.count)
+            assert operations.waits == []
+    assert counts[1] < 1.15 * counts[0]
+    assert counts[1] < 1500
+
+
+def test_step_of_a_deep_image_prior_waits_for_no_gpu():
+    with pretend_cuda() as gpu:
+        sample = _sample()
+        options = DeepImagePrior(scale=4, downsampling=Downsampling("box"), widths=[4] * 5, device=gpu)
+        module = PriorOptimisation(options, sample, visual=True)
+        optimizer = module.configure_optimizers()
+        for warm in (False, True):
+            operations = _Operations()
+            with operations if warm else contextlib.nullcontext():
+                module.loss_terms(*module())["loss"].backward()
+                optimizer.step()
+                optimizer.zero_grad()
+    assert operations.waits == []
+    assert operations.count < 500
+
+
+def test_inference_of_facets_asks_a_gpu_once_whether_there_are_holes():
+    with pretend_cuda() as gpu, torch.no_grad():
+        net = FacetsUNet(4, width=8, deep=8).eval().to(gpu)
+        rgb, disparity = torch.rand(1, 3, 128, 128, device=gpu), 1 + torch.rand(1, 1, 32, 32, device=gpu)
+        net.answer(rgb, disparity)
+        with _Operations() as operations:
+            net.answer(rgb, disparity)
+    assert operations.waits == ["_local_scalar_dense"]
+    assert operations.count < 700
 
 
 @pytest.mark.parametrize("method", ["facets", "bicubic"])

@@ -235,6 +235,7 @@ class PriorOptimisation(lightning.LightningModule):
         loss = DATA_WEIGHTS[options.data_loss] * data
         if self.w:
             surfaces = SurfacePair(depth_lr, self.depth_lr, self.rays_lr)
+            surfaces.complete = complete or surfaces.complete  # which is not asked of a GPU
             if surfaces.complete and self.normals_lr is not None:
                 surfaces.normals = depth_to_normals(depth_lr, self.rays_lr), self.normals_lr
             visual = options.visual_loss(surfaces).squeeze()
