@@ -36,7 +36,7 @@ from dsr.training.module import SuperResolution
 from dsr.training.objective import DepthObjective, SurfaceObjective
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings
-from dsr.utils.compute_device import fast_precision, pick_device
+from dsr.utils.compute_device import fast_precision, in_own_precision, pick_device
 from dsr.utils.configuration import ConfigError
 
 METHODS = [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in AT_HAND]
@@ -253,6 +253,33 @@ def test_auto_is_the_device_of_the_environment(monkeypatch, gpu):
     monkeypatch.setenv("DSR_DEVICE", "abacus")
     with pytest.raises(ConfigError, match=r"^\$DSR_DEVICE: expected auto, .*, got 'abacus'"):
         pick_device("auto")
+
+
+def test_tf32_is_for_those_who_ask_for_it_and_not_for_losses():
+    backends = torch.backends.cudnn, torch.backends.cuda.matmul
+
+    def used(_=None):
+        return [backend.allow_tf32 for backend in backends]
+
+    before = used()
+    with pretend_cuda():
+        for precision, expected in (("tf32", [True, True]), ("float32", [False, False])):
+            pick_device("cuda", precision=precision)
+            assert used() == expected
+            assert in_own_precision(used)(torch.ones(1)) == [False, False]
+            assert used() == expected
+    for backend, allowed in zip(backends, before, strict=True):
+        backend.allow_tf32 = allowed
+
+
+@pytest.mark.parametrize(
+    ("name", "precision", "error"),
+    [("cpu", "tf32", "precision: expected auto, float32 or bfloat16 on device=cpu, got tf32"),
+     ("mps", "float32", "device: expected auto, cpu or cuda, got 'mps'")],
+)  # fmt: skip
+def test_what_a_device_cannot_compute_is_refused(name, precision, error):
+    with pytest.raises(ConfigError, match=f"^{error}"):
+        pick_device(name, precision=precision)
 
 
 @pytest.mark.parametrize(

@@ -132,7 +132,7 @@ def _prepare(
     recipe = Recipe(settings.names["method"], OmegaConf.create(node), user_directories(), plain)
     if "downsampling.assumed" in given_keys() and not recipe.abilities.assumes_downsampling:
         raise ConfigError(f"downsampling.assumed: method={recipe.name} assumes no downsampling model; leave it out")
-    device = pick_device(settings.device, recipe.abilities.fast_on) if here else torch.device("cpu")
+    device = pick_device(settings.device, recipe.abilities.fast_on, settings.precision) if here else torch.device("cpu")
     precision = settings.precision
     if precision == "auto":
         precision = fast_precision(device) if recipe.abilities.optimises else "float32"

@@ -27,7 +27,7 @@ NAMED = ("dataset", "downsampling", "noise", "holes", "degradation", "method", "
 # Keys that users of Lightning look for, and those that dsr has for them.
 _OF_LIGHTNING = {
     "ckpt_path": "resume=RUN_DIR of train.py or run=RUN_DIR of eval.py",
-    "precision": "precision=bfloat16 or float32",
+    "precision": "precision=bfloat16, tf32 or float32",
 }
 _LONGEST_NAME = 100
 _MOST = 1024  # workers and threads, more of which no system starts
@@ -115,7 +115,7 @@ class RunConfig:
         """Check values beyond their types."""
         for group, name in self.names.items():
             expect_name(f"names.{group}", str(name))
-        _expect_one_of("precision", self.precision, ("float32", "bfloat16", "auto"))
+        _expect_one_of("precision", self.precision, ("float32", "tf32", "bfloat16", "auto"))
         if self.seed < 0:
             raise ConfigError(f"seed: expected 0 or a positive number, got {self.seed}")
 

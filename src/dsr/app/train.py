@@ -163,7 +163,7 @@ def _read(config: DictConfig, *, here: bool = True) -> tuple[dict[str, Any], Tra
         device = {"device": plain["device"]} if "device" in given_keys() else {}
         plain = {**before, **device, "resume": None, "output_dir": str(folder), "overwrite": False, "trust": None}
     settings = TrainConfig.of(plain)
-    chosen = pick_device(settings.device) if here else torch.device("cpu")
+    chosen = pick_device(settings.device, precision=settings.precision) if here else torch.device("cpu")
     if settings.precision == "auto":
         plain["precision"] = settings.precision = fast_precision(chosen)
     return plain, settings, chosen

@@ -38,9 +38,10 @@ def in_own_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
     @functools.wraps(function)
     def computed(*given: _P.args, **named: _P.kwargs) -> _R:
         with contextlib.ExitStack() as stack:
-            if torch.backends.cudnn.allow_tf32 and torch.cuda.is_available():
-                stack.callback(setattr, torch.backends.cudnn, "allow_tf32", True)
-                torch.backends.cudnn.allow_tf32 = False
+            for backend in (torch.backends.cudnn, torch.backends.cuda.matmul):
+                if backend.allow_tf32 and torch.cuda.is_available():
+                    stack.callback(setattr, backend, "allow_tf32", True)
+                    backend.allow_tf32 = False
             for kind in ("cpu", "cuda", "mps", "xpu"):
                 if torch.is_autocast_enabled(kind):
                     stack.enter_context(torch.autocast(kind, enabled=False))
@@ -54,8 +55,8 @@ def known_true(flags: Tensor) -> bool:
     return flags.device.type == "cpu" and bool(flags.all())
 
 
-def pick_device(name: str, fast_on: str = "any") -> torch.device:
-    """Return the device of that name; on a GPU, convolutions in float32 no longer use TF32.
+def pick_device(name: str, fast_on: str = "any", precision: str = "float32") -> torch.device:
+    """Return the device of that name; on a GPU, convolutions and products in float32 use TF32 for ``tf32`` alone.
 
     ``auto`` is $DSR_DEVICE, else the first GPU where there is one and the method is ``fast_on`` any, else the CPU.
     """
@@ -64,11 +65,17 @@ def pick_device(name: str, fast_on: str = "any") -> torch.device:
         given_by, name = "$DSR_DEVICE", os.environ["DSR_DEVICE"]
     if name == "auto":
         name = "cuda" if fast_on == "any" and torch.cuda.is_available() else "cpu"
+    if name.startswith("mps"):
+        raise ConfigError(f"{given_by}: expected auto, cpu or cuda, got {name!r}, which has no float64")
     try:
         device = torch.device(name)
         torch.zeros(1, device=device).item()
     except (RuntimeError, AssertionError) as error:  # torch asserts that it was built for CUDA
         raise ConfigError(f"{given_by}: expected auto, cpu or a device of this machine, got {name!r}") from error
     if device.type == "cuda":
-        torch.backends.cudnn.allow_tf32 = False
+        torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = precision == "tf32"
+    elif precision == "tf32":
+        raise ConfigError(
+            f"precision: expected auto, float32 or bfloat16 on device={device}, got tf32, which GPUs have"
+        )
     return device

@@ -29,9 +29,9 @@ from dsr.utils.compute_device import widened
 from dsr.utils.guards import expect_one_of
 from dsr.utils.progress import Steps
 
-Precision = Literal["float32", "bfloat16"]
+Precision = Literal["float32", "tf32", "bfloat16"]
 ENSEMBLES = (1, 4, 8)
-DTYPES = MappingProxyType({"float32": torch.float32, "bfloat16": torch.bfloat16})
+DTYPES = MappingProxyType({"float32": torch.float32, "tf32": torch.float32, "bfloat16": torch.bfloat16})
 _OVERLAP = 4
 _UNKNOWN = torch.tensor(math.nan)
 
