@@ -111,7 +111,7 @@ def validations_of(home):
 def test_training_reports_what_it_does_and_writes_the_documented_files(smoke):
     folder, home, done = smoke
     lines = done.stdout.splitlines()
-    assert re.fullmatch(r"model  msg_v x4, 326,015 parameters, (float32|bfloat16)", lines[0])
+    assert re.fullmatch(r"model  msg_v x4, 326,015 parameters, (float32|bfloat16) on cpu", lines[0])
     assert lines[1] == "data   5 scenes of procedural to train on, 1 of procedural to validate with"
     assert lines[2] == "steps  2 of 2 patches of 32 x 32"
     assert lines[3] == f"log    tensorboard --logdir outputs/train/{home.name}"

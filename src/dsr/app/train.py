@@ -222,7 +222,7 @@ class _Training:
         resumable = ("results_version", "scenes_version", "outside_code", "device")
         self.tolerated = resumable if "resume" in given_keys() else ()
         self.resume = folder / _LAST if (folder / _LAST).is_file() and not settings.overwrite else None
-        self.plain, self.settings, self.identity, self.folder = plain, settings, identity, folder
+        self.plain, self.settings, self.identity, self.folder, self.device = plain, settings, identity, folder, device
         self.data, self.module, self.trainer, self.best, self.progress = data, module, trainer, best, progress
 
     def run(self) -> float:
@@ -239,7 +239,7 @@ class _Training:
         several += f" x {trainer.world_size} devices" if trainer.world_size > 1 else ""
         logs = (f"tensorboard --logdir {folder}" if name == "tensorboard" else name for name in settings.logger)
         for line in (
-            f"model  {settings.names['model']} x{settings.scale}, {parameters:,} parameters, {settings.precision}",
+            f"model  {settings.names['model']} x{settings.scale}, {parameters:,} parameters, {settings.precision} on {self.device}",
             f"data   {count} scenes of {settings.names['dataset']} to train on, {held_out} to validate with",
             f"steps  {settings.steps} of {data.patches.batch} patches of {patch} x {patch}{several}"
             f"{', resumed' if self.resume else ''}",

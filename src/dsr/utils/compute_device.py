@@ -38,7 +38,8 @@ def in_own_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
     @functools.wraps(function)
     def computed(*given: _P.args, **named: _P.kwargs) -> _R:
         with contextlib.ExitStack() as stack:
-            for backend in (torch.backends.cudnn, torch.backends.cuda.matmul):
+            backends: tuple[Any, ...] = torch.backends.cudnn, torch.backends.cuda.matmul
+            for backend in backends:
                 if backend.allow_tf32 and torch.cuda.is_available():
                     stack.callback(setattr, backend, "allow_tf32", True)
                     backend.allow_tf32 = False
