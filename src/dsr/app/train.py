@@ -177,7 +177,7 @@ class _Training:
             raise ConfigError(f"seed: expected at most {_LARGEST_SEED}, got {settings.seed}")
         lightning.seed_everything(settings.seed, workers=True, verbose=False)
         net = _network(settings)
-        data = training_data(settings, processes.count)
+        data = training_data(settings, processes.count, device)
         if settings.downsampling.get("assumed") is not None:
             raise ConfigError("downsampling.assumed: a training assumes no downsampling model; leave it out")
         check_metrics(settings.metrics)
@@ -238,8 +238,9 @@ class _Training:
         patch, several = data.patches.patch, f" x {settings.accumulate} batches" if settings.accumulate > 1 else ""
         several += f" x {trainer.world_size} devices" if trainer.world_size > 1 else ""
         logs = (f"tensorboard --logdir {folder}" if name == "tensorboard" else name for name in settings.logger)
+        computed = f"{parameters:,} parameters, {settings.precision} on {self.device}"
         for line in (
-            f"model  {settings.names['model']} x{settings.scale}, {parameters:,} parameters, {settings.precision} on {self.device}",
+            f"model  {settings.names['model']} x{settings.scale}, {computed}",
             f"data   {count} scenes of {settings.names['dataset']} to train on, {held_out} to validate with",
             f"steps  {settings.steps} of {data.patches.batch} patches of {patch} x {patch}{several}"
             f"{', resumed' if self.resume else ''}",

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -170,7 +171,7 @@ def studies_of_run(plain: Config, given: Sequence[str]) -> Iterator[tuple[dict[s
         yield {**base, **place, **there}, SceneSubset(source, scenes)
 
 
-def training_data(settings: TrainConfig, devices: int = 1) -> PatchData:
+def training_data(settings: TrainConfig, devices: int = 1, device: torch.device | str = "cpu") -> PatchData:
     """Build the patches that the configuration describes, for a number of devices."""
     downsampling = settings.build("downsampling")
     if not isinstance(downsampling, Downsampling):
@@ -190,6 +191,7 @@ def training_data(settings: TrainConfig, devices: int = 1) -> PatchData:
             validation=validation,
             everything=everything,
             patches_per_step=patches.batch * settings.accumulate * devices,
+            device=device,
         )
 
 

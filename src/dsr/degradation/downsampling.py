@@ -122,6 +122,13 @@ def _matrix(kernel: Kernel, sigma: float, size: int, scale: int, dtype: torch.dt
     return (weights / weights.sum(dim=1, keepdim=True)).to(device, dtype)
 
 
+def kernel_matrix(model: Downsampling, size: int, scale: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return the weights with which a model averages the pixels along an axis, (size / scale, size)."""
+    if model.kernel == "nearest":
+        return torch.eye(size, dtype=dtype, device=device)[scale // 2 :: scale]
+    return _matrix(model.kernel, model.sigma, size, scale, dtype, device)
+
+
 def cubic_kernel(x: Tensor, a: float = -0.5) -> Tensor:
     """Return the weights of cubic convolution (Keys 1981) at distances of ``x`` pixels, 0 or more."""
     near = ((a + 2) * x - (a + 3)) * x * x + 1

@@ -10,6 +10,7 @@ from typing import Any
 
 import lightning
 import torch
+from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, default_collate
 
 from dsr.data.scene_source import SceneSource, as_source
@@ -18,6 +19,7 @@ from dsr.degradation.random_degradation import Everything
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.sample import Scene
 from dsr.training.degradation import Batch, Degradation, to_tensors
+from dsr.training.device_patches import DevicePatches, made_by_workers
 from dsr.training.patches import Patches, check_patches
 from dsr.training.settings import PatchSettings
 from dsr.utils import interruption
@@ -70,6 +72,7 @@ class PatchData(lightning.LightningDataModule):
         validation: more data sets to validate with, by name; their scenes without a true depth are left out.
         everything: the distribution of degradations to train on in place of ``degradation``.
         patches_per_step: of all devices and batches of a step; None for those of one batch.
+        device: the device of the training, which ``settings`` of ``auto`` depend on.
 
     """
 
@@ -83,8 +86,10 @@ class PatchData(lightning.LightningDataModule):
         validation: Mapping[str, SceneSource] | None = None,
         everything: Everything | None = None,
         patches_per_step: int | None = None,
+        device: torch.device | str = "cpu",
     ) -> None:
         super().__init__()
+        self._device = torch.device(device)
         check_patches((), settings, degradation.scale)
         self._everything, self._per_step = everything, patches_per_step
         self.patches, self._degradation, self._seed = settings, degradation, seed
@@ -124,7 +129,7 @@ class PatchData(lightning.LightningDataModule):
             [derived(scene, depth=scene.true_depth.float()) for scene in map(source.load, names)]
             for source, names in self.trained
         ]
-        self._cut = Patches(
+        self._cut = (DevicePatches if self._on_device(groups) else Patches)(
             groups, self.patches, self._degradation, shares=self._shares, seed=self._seed, everything=self._everything,
             per_step=self._per_step,
         )  # fmt: skip
@@ -135,21 +140,55 @@ class PatchData(lightning.LightningDataModule):
             self.held_out[kind] = (source, [scene.name for scene in known])
             self._validation.append(known)
 
+    def _on_device(self, groups: Sequence[Sequence[Scene]]) -> bool:
+        """Return whether the patches are made on the training's device; a ValueError if they are to be and cannot."""
+        wanted = self.patches.on_device
+        if not wanted or (wanted == "auto" and self._device.type == "cpu"):
+            return False
+        left = made_by_workers(self._degradation, self._everything)
+        if not left and not all(bool(scene.true_depth.isfinite().all()) for group in groups for scene in group):
+            left = "dataset, whose true depth has holes"
+        if left and wanted != "auto":
+            raise ValueError(f"on_device: expected false or auto, workers alone make the patches of this {left}")
+        return not left
+
     def first_patches(self, count: int) -> list[Batch]:
         """Return the first ``count`` patches of the run."""
         self.setup()
-        return [self._cut[number] for number in range(count)]
+        if not isinstance(self._cut, DevicePatches):
+            return [self._cut[number] for number in range(count)]
+        self._cut.store(torch.device("cpu"))
+        made = [self._cut.make(self._cut.collate([self._cut[number]])) for number in range(count)]
+        tensors = ({key: each for key, each in patch.items() if isinstance(each, Tensor)} for patch in made)
+        return [{key: each[0] for key, each in patch.items()} for patch in tensors]
+
+    def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
+        """Make the patches of a training's batch on its device, if they are to be made there."""
+        if "places" not in batch or not isinstance(self._cut, DevicePatches):
+            return batch
+        patches = self._cut.make(batch)
+        net: Any = getattr(getattr(self.trainer, "lightning_module", None), "net", None)
+        offset = patches["doffs"] if getattr(net, "of_inverse_depth", False) else 0
+        return {**patches, "filled": patches["disparity_lr"] + offset}  # there are no holes to fill
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Return a loader of an epoch's patches, which begins at the trainer's current step."""
         self.setup()
         module: Any = getattr(self.trainer, "lightning_module", None)
         prepare = getattr(getattr(module, "net", None), "prepare", None)
+        collate = functools.partial(_collate_prepared, prepare) if prepare else None
+        workers = self.patches.workers
+        if workers == "auto":
+            workers = 0 if self._device.type == "cpu" else max(1, len(os.sched_getaffinity(0)) - 1)
+        if isinstance(self._cut, DevicePatches):
+            root = self._device if self.trainer is None else self.trainer.strategy.root_device
+            self._cut.store(root)
+            collate, workers = self._cut.collate, 0
         return _PatchLoader(
             self._cut,
             batch_sampler=_PatchNumbers(self.trainer, self.patches.batch),
-            collate_fn=functools.partial(_collate_prepared, prepare) if prepare else None,
-            num_workers=self.patches.workers,
+            collate_fn=collate,
+            num_workers=workers,
             worker_init_fn=functools.partial(_begin_worker, os.getpid()),
             pin_memory=torch.cuda.is_available(),
         )

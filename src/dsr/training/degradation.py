@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.degradation.noise import Noise
@@ -39,7 +40,6 @@ def to_tensors(sample: DepthSample, dtype: torch.dtype = torch.float32) -> Batch
         raise ValueError(f"{sample.scene}: expected a true depth to train with, there is none")
     camera, disparity = sample.camera, sample.disparity_lr()
     low, high = compute_min_max(disparity[None]).flatten()
-    min_range = 1e-3 * high.abs().clamp(min=1e-3)  # of a map without relief
     return {
         "rgb": sample.rgb.float(),
         "disparity_lr": disparity.to(dtype),
@@ -47,5 +47,10 @@ def to_tensors(sample: DepthSample, dtype: torch.dtype = torch.float32) -> Batch
         "rays": camera.rays(dtype=dtype),
         "bf": torch.full((1, 1, 1), baseline_times_focal(camera), dtype=dtype),
         "doffs": torch.full((1, 1, 1), camera.doffs, dtype=dtype),
-        "min_max": torch.stack((low, torch.maximum(high, low + min_range))).view(2, 1, 1).float(),
+        "min_max": torch.stack((low, torch.maximum(high, low + least_range(high)))).view(2, 1, 1).float(),
     }
+
+
+def least_range(highest: Tensor) -> Tensor:
+    """Return the least range of disparities that a network's input is divided by, that of a map without relief."""
+    return 1e-3 * highest.abs().clamp(min=1e-3)

@@ -8,6 +8,7 @@ import contextlib
 import itertools
 import math
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from torch.utils.data import Dataset
 
 from dsr.degradation.downsampling import Downsampling
 from dsr.degradation.random_degradation import Everything
-from dsr.geometry.camera import baseline_times_focal
+from dsr.geometry.camera import Camera, baseline_times_focal
 from dsr.methods.images import compute_min_max
 from dsr.sample import AllHolesError, Scene
 from dsr.training.degradation import Batch, Degradation, to_tensors
@@ -78,7 +79,7 @@ class Patches(Dataset[Batch]):
     def _patch(self, number: int, random: np.random.Generator) -> Batch:
         """Return a random patch; with a distribution of degradations, ``noise`` and ``facts`` are hints."""
         everything, size = self._everything, self._settings.patch
-        group = min(int(np.searchsorted(self._limits, random.random(), "right")), len(self._groups) - 1)
+        group = self._draw_group(random)
         soft = everything is not None and random.random() < everything.soft
         halved = soft and min(min(scene.rgb.shape[-2:]) for scene in self._groups[group]) >= 2 * size
         window = 2 * size if halved else size
@@ -93,23 +94,39 @@ class Patches(Dataset[Batch]):
         if everything is None:
             sample = self._degradation.sample(scene, generator)
             patch = to_tensors(sample)
-            if (group, index) not in self._depth_ranges:  # of the scene's low-resolution map, in metres
-                whole = self._degradation.sample(self._groups[group][index], clean=True).depth_lr
-                self._depth_ranges[group, index] = compute_min_max(whole[None]).flatten().tolist()
-            near, far = self._depth_ranges[group, index]
-            # In use a network sees whole images, whose disparities have a larger range than a patch's. So half of the
-            # patches are normalised with the range of the scene's map, the others with one between it and their own.
-            bf, doffs, own = baseline_times_focal(sample.camera), sample.camera.doffs, patch["min_max"]
-            extent = torch.tensor([bf / (factor * far) - doffs, bf / (factor * near) - doffs]).view(2, 1, 1)
+            low, high, weight = self._draw_extent(group, index, factor, sample.camera, random)
+            extent, own = torch.tensor([low, high]).view(2, 1, 1), patch["min_max"]
             extent = torch.stack((torch.minimum(extent[0], own[0]), torch.maximum(extent[1], own[1])))
-            weight = random.random() if random.random() < 0.5 else 1.0
             patch["min_max"] = own + weight * (extent - own)
             return patch
+        sample, hints = everything(scene, self._draw_scale(number), generator, soft=soft)
+        return {**to_tensors(sample), **hints._asdict(), "soft": torch.tensor(float(soft))}
+
+    def _draw_group(self, random: np.random.Generator) -> int:
+        return min(int(np.searchsorted(self._limits, random.random(), "right")), len(self._groups) - 1)
+
+    def _draw_scale(self, number: int) -> int:
+        """Return the factor of the step that a patch belongs to."""
+        assert self._everything is not None  # noqa: S101 - the caller's case
         of_step = np.random.default_rng([self._seed, number // self._per_step, 1])
         drawing = torch.Generator().manual_seed(int(of_step.integers(2**62)))
-        scale = everything.draw_scale(self._degradation.scale, drawing)
-        sample, hints = everything(scene, scale, generator, soft=soft)
-        return {**to_tensors(sample), **hints._asdict(), "soft": torch.tensor(float(soft))}
+        return self._everything.draw_scale(self._degradation.scale, drawing)
+
+    def _draw_extent(
+        self, group: int, index: int, factor: float, camera: Camera, random: np.random.Generator
+    ) -> tuple[float, float, float]:
+        """Return the range of disparity of a scene's whole map, and its weight beside the patch's own range.
+
+        In use a network sees whole images, whose disparities have a larger range than a patch's. So half of the patches
+        are normalised with the range of the scene's map, the others with one between it and their own.
+        """
+        if (group, index) not in self._depth_ranges:  # of the scene's low-resolution map, in metres
+            whole = self._degradation.sample(self._groups[group][index], clean=True).depth_lr
+            self._depth_ranges[group, index] = compute_min_max(whole[None]).flatten().tolist()
+        near, far = self._depth_ranges[group, index]
+        bf, doffs = baseline_times_focal(camera), camera.doffs
+        weight = random.random() if random.random() < 0.5 else 1.0
+        return bf / (factor * far) - doffs, bf / (factor * near) - doffs, weight
 
     def _window(self, group: int, random: np.random.Generator, size: int) -> tuple[int, int, int]:
         """Return a random window of a group: the number of the scene, the top and the left."""
@@ -131,27 +148,46 @@ class Patches(Dataset[Batch]):
         raise ValueError("patches: expected scenes with more known depth than a few pixels")
 
 
+class Changes(NamedTuple):
+    """How a patch is changed at random."""
+
+    gain: Any  # of each colour channel, (3, 1, 1), or 1
+    photo: tuple[float, float, float, Any] | None  # its exponent, blur in pixels, and noise: its strength and values
+    mirrored: tuple[bool, bool]  # left to right, top to bottom
+    turns: int  # quarter turns counterclockwise, after that
+    factor: float  # of depth
+
+
+def draw_changes(settings: PatchSettings, random: np.random.Generator, shape: Sequence[int] | None = None) -> Changes:
+    """Draw the changes of a patch; ``shape`` (3, H, W) is that of a photo's noise, None if it is drawn elsewhere."""
+    gain = 1 + settings.colour * random.standard_normal((3, 1, 1)) if settings.colour else np.ones((3, 1, 1))
+    photo = None
+    if random.random() < settings.photo:
+        exponent, sigma, strength = math.exp(random.uniform(-0.5, 0.5)), random.uniform(0, 1.0), random.uniform(0, 0.03)
+        photo = exponent, sigma, strength, None if shape is None else random.standard_normal(shape)
+    mirrored = (random.random() < 0.5, random.random() < 0.5) if settings.flip else (False, False)
+    turns = int(random.integers(4)) if settings.rotate else 0
+    factor = math.exp(random.uniform(-settings.depth_scale, settings.depth_scale)) if settings.depth_scale else 1.0
+    return Changes(gain, photo, mirrored, turns, factor)
+
+
 def augment(scene: Scene, settings: PatchSettings, random: np.random.Generator) -> tuple[Scene, float]:
     """Return a scene changed at random, rgb, depth and camera alike, and the factor that multiplied its depth."""
+    changes = draw_changes(settings, random, scene.rgb.shape)
     rgb = scene.rgb
     if settings.colour:
-        gain = torch.from_numpy(1 + settings.colour * random.standard_normal((3, 1, 1))).float()
-        rgb = (rgb * gain).clamp(0, 1)
-    if random.random() < settings.photo:
-        pixels = rgb.clamp(min=0).numpy() ** math.exp(random.uniform(-0.5, 0.5))
-        sigma = random.uniform(0, 1.0)
-        pixels = ndimage.gaussian_filter(pixels, (0, sigma, sigma), mode="nearest")
-        pixels = pixels + random.uniform(0, 0.03) * random.standard_normal(pixels.shape)
+        rgb = (rgb * torch.from_numpy(changes.gain).float()).clamp(0, 1)
+    if changes.photo is not None:
+        exponent, sigma, strength, noise = changes.photo
+        pixels = rgb.clamp(min=0).numpy() ** exponent
+        pixels = ndimage.gaussian_filter(pixels, (0, sigma, sigma), mode="nearest") + strength * noise
         rgb = torch.from_numpy(pixels.astype(np.float32)).clamp(0, 1)
     scene = derived(scene, rgb=rgb)
-    if settings.flip:
-        for vertical in (False, True):
-            if random.random() < 0.5:
-                scene = mirror(scene, vertical=vertical)
-    if settings.rotate:
-        scene = rotate90(scene, int(random.integers(4)))
-    factor = math.exp(random.uniform(-settings.depth_scale, settings.depth_scale)) if settings.depth_scale else 1.0
-    return derived(scene, depth=scene.true_depth * factor), factor
+    for vertical, mirrored in enumerate(changes.mirrored):
+        if mirrored:
+            scene = mirror(scene, vertical=bool(vertical))
+    scene = rotate90(scene, changes.turns)
+    return derived(scene, depth=scene.true_depth * changes.factor), changes.factor
 
 
 def soften(scene: Scene, sigma: float = 0.0, *, halve: bool = True) -> Scene:
@@ -176,12 +212,15 @@ def soften(scene: Scene, sigma: float = 0.0, *, halve: bool = True) -> Scene:
 
 def mirror(scene: Scene, *, vertical: bool = False) -> Scene:
     """Return the mirror image of a scene and its camera, left to right or, with ``vertical``, top to bottom."""
-    camera = scene.camera
-    if vertical:
-        axis, camera = -2, derived(camera, cy=camera.height - 1 - camera.cy)
-    else:
-        axis, camera = -1, derived(camera, cx=camera.width - 1 - camera.cx)
+    axis, camera = -2 if vertical else -1, mirror_camera(scene.camera, vertical=vertical)
     return derived(scene, rgb=scene.rgb.flip(axis), depth=scene.true_depth.flip(axis), camera=camera, measured={})
+
+
+def mirror_camera(camera: Camera, *, vertical: bool = False) -> Camera:
+    """Return the camera of a mirror image."""
+    if vertical:
+        return derived(camera, cy=camera.height - 1 - camera.cy)
+    return derived(camera, cx=camera.width - 1 - camera.cx)
 
 
 def rotate90(scene: Scene, turns: int) -> Scene:

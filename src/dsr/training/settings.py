@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 from dsr.utils.guards import expect_memory
 
@@ -19,7 +20,9 @@ class PatchSettings:
         batch: number of patches per step and device.
         validation_scenes: number of scenes at the end of each data set that are kept for validation.
         scenes: number of scenes to use of each data set, from its first on; None for all.
-        workers: number of additional processes that crop patches.
+        workers: number of additional processes that crop patches; ``auto`` for none on a CPU, and beside a GPU for one
+            less than there are cores.
+        on_device: whether a GPU makes the patches; ``auto``: where it can, as ``conf/trainer/default.yaml`` says.
         flip: whether scenes are mirrored at random, horizontally and vertically.
         rotate: whether scenes are rotated by random quarter turns, the camera included.
         depth_scale: s, where depth is multiplied by exp(U(-s, s)).
@@ -32,7 +35,8 @@ class PatchSettings:
     batch: int = 6
     validation_scenes: int = 4
     scenes: int | None = None
-    workers: int = 0
+    workers: int | Literal["auto"] = "auto"
+    on_device: bool | Literal["auto"] = "auto"
     flip: bool = True
     rotate: bool = True
     depth_scale: float = 0.3
@@ -45,6 +49,8 @@ class PatchSettings:
                   "validation_scenes": (0, math.inf)}  # fmt: skip
         for name, (least, most) in ranges.items():
             value = getattr(self, name)
+            if name == "workers" and value == "auto":
+                continue
             if not least <= value <= most or value == math.inf:
                 expected = f"{least} or more" if most == math.inf else f"{least} to {most:g}"
                 raise ValueError(f"{name}: expected {expected}, got {value}")
@@ -52,4 +58,7 @@ class PatchSettings:
             raise ValueError(f"scenes: expected a positive number, or null for all, got {self.scenes}")
         expect_memory("patch", self.patch, _BYTES * self.patch**2)
         expect_memory("batch", self.batch, _BYTES * self.batch * self.patch**2)
-        expect_memory("workers", self.workers, _BYTES_OF_WORKER * self.workers)
+        if self.on_device not in (True, False, "auto"):
+            raise ValueError(f"on_device: expected true, false or auto, got {self.on_device}")
+        if self.workers != "auto":
+            expect_memory("workers", self.workers, _BYTES_OF_WORKER * self.workers)
