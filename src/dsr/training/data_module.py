@@ -97,6 +97,7 @@ class PatchData(lightning.LightningDataModule):
         self.trained: list[tuple[SceneSource, list[str]]] = []  # data sets and names of their scenes to train on
         # likewise to validate with, by validation set; scenes without a true depth leave it at ``setup``
         self.held_out: dict[str, tuple[SceneSource, list[str]]] = {}
+        self._makes_patches(made_by_workers(degradation, everything))
         held_out: list[tuple[str, SceneSource, list[str]]] = []
         for part in parts:
             if not 0 <= part.share < math.inf:
@@ -129,7 +130,11 @@ class PatchData(lightning.LightningDataModule):
             [derived(scene, depth=scene.true_depth.float()) for scene in map(source.load, names)]
             for source, names in self.trained
         ]
-        self._cut = (DevicePatches if self._on_device(groups) else Patches)(
+        kind = Patches
+        if self._makes_patches(made_by_workers(self._degradation, self._everything)):
+            holed = any(bool(scene.true_depth.isnan().any()) for group in groups for scene in group)
+            kind = DevicePatches if self._makes_patches("a true depth with holes" if holed else "") else Patches
+        self._cut = kind(
             groups, self.patches, self._degradation, shares=self._shares, seed=self._seed, everything=self._everything,
             per_step=self._per_step,
         )  # fmt: skip
@@ -140,17 +145,12 @@ class PatchData(lightning.LightningDataModule):
             self.held_out[kind] = (source, [scene.name for scene in known])
             self._validation.append(known)
 
-    def _on_device(self, groups: Sequence[Sequence[Scene]]) -> bool:
-        """Return whether the patches are made on the training's device; a ValueError if they are to be and cannot."""
+    def _makes_patches(self, left_to_workers: str) -> bool:
+        """Return whether the training's device makes the patches; a ValueError if it is to make what it cannot."""
         wanted = self.patches.on_device
-        if not wanted or (wanted == "auto" and self._device.type == "cpu"):
-            return False
-        left = made_by_workers(self._degradation, self._everything)
-        if not left and not all(bool(scene.true_depth.isfinite().all()) for group in groups for scene in group):
-            left = "dataset, whose true depth has holes"
-        if left and wanted != "auto":
-            raise ValueError(f"on_device: expected false or auto, workers alone make the patches of this {left}")
-        return not left
+        if left_to_workers and wanted is True:
+            raise ValueError(f"on_device: expected false or auto, {left_to_workers} is left to workers")
+        return not left_to_workers and (wanted is True or (wanted == "auto" and self._device.type != "cpu"))
 
     def first_patches(self, count: int) -> list[Batch]:
         """Return the first ``count`` patches of the run."""
