@@ -177,9 +177,7 @@ def test_holes_of_a_truth_are_left_to_workers_and_refused_where_a_device_is_to_m
     depth = holed.depth.clone()
     depth[:, 3, 3] = torch.nan
     scenes = replace(holed, depth=depth), _scene(1)
-    with pytest.raises(
-        ValueError, match=r"^on_device: .* a true depth with holes is left"
-    ):
+    with pytest.raises(ValueError, match=r"^on_device: .* a true depth with holes is left"):
         _data(*scenes, on_device=True).setup()
     with pytest.raises(ValueError, match=r"^on_device: .* degradation\.folds is left"):
         _data(on_device=True, everything=Everything())

@@ -90,7 +90,12 @@ def _data(scenes=None, degradation=X4, **changes):
 def _batches(data, count, step=0, *, accumulate=1, rank=0, world=1):
     """Return the first batches that a trainer at some step gets."""
     data.trainer = SimpleNamespace(
-        global_step=step, accumulate_grad_batches=accumulate, global_rank=rank, world_size=world, max_steps=8
+        global_step=step,
+        accumulate_grad_batches=accumulate,
+        global_rank=rank,
+        world_size=world,
+        max_steps=8,
+        strategy=SimpleNamespace(root_device=torch.device("cpu")),
     )
     data.setup()
     return list(itertools.islice(data.train_dataloader(), count))

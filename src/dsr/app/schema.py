@@ -33,7 +33,7 @@ _LONGEST_NAME = 100
 _MOST = 1024  # workers and threads, more of which no system starts
 # Arguments of the trainer that dsr reads itself, and their defaults.
 READ_OF_TRAINER = {"max_steps": 12000, "val_check_interval": 1000, "accumulate_grad_batches": 1, "devices": 1,
-                   "strategy": "auto", "gradient_clip_val": None}  # fmt: skip
+                   "strategy": "auto", "gradient_clip_val": None, "compile": False}  # fmt: skip
 # Arguments of the trainer that dsr gives itself.
 SET_BY_DSR = ("plugins", "use_distributed_sampler", "num_nodes", "default_root_dir", "enable_checkpointing",
                "barebones", "inference_mode", "max_epochs", "min_epochs", "max_time")  # fmt: skip
@@ -210,6 +210,7 @@ class TrainConfig(RunConfig):
         for name in ("max_steps", "val_check_interval", "accumulate_grad_batches", "devices"):
             if not _is_count(trainer[name]) and (name, trainer[name]) != ("devices", "auto"):
                 raise ConfigError(f"trainer.{name}: expected a whole number, 1 or more, got {trainer[name]!r:.60}")
+        _expect_one_of("trainer.compile", trainer["compile"], (True, False))
         clip = trainer["gradient_clip_val"]
         if clip is not None and not (is_number(clip) and clip > 0):
             raise ConfigError(f"trainer.gradient_clip_val: expected a positive number or null, got {clip!r:.60}")

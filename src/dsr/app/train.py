@@ -182,6 +182,8 @@ class _Training:
             raise ConfigError("downsampling.assumed: a training assumes no downsampling model; leave it out")
         check_metrics(settings.metrics)
         module = _module(settings, net, data)
+        if settings.trainer["compile"]:
+            module.net.compile(dynamic=False)
         identity = rundir.identity_of(plain, None, device)
         folder = rundir.directory_of("train", plain, identity, given_overrides())
         progress = ConsoleProgress(Console(quiet=processes.rank > 0))

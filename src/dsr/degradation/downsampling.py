@@ -13,7 +13,6 @@ At the border, kernels are truncated and normalised.
 
 from __future__ import annotations
 
-import functools
 import hashlib
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, get_args
@@ -26,7 +25,7 @@ from dsr.degradation.holes import Holes
 from dsr.degradation.noise import Noise
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
 from dsr.sample import FARTHEST, NEAREST, AllHolesError, DepthSample, Scene
-from dsr.utils.compute_device import known_true
+from dsr.utils.compute_device import known_true, made_once
 from dsr.utils.guards import expect_one_of, naming, unchecked
 from dsr.utils.ratios import check_scale, match_ratio
 
@@ -105,8 +104,7 @@ class Downsampling:
         return rows @ values @ columns.T
 
 
-@functools.lru_cache(maxsize=16)
-@torch.inference_mode(mode=False)  # so that gradients can be computed with it
+@made_once
 def _matrix(kernel: Kernel, sigma: float, size: int, scale: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return a kernel's weights, (size / scale, size); every row sums to 1."""
     centres = (torch.arange(size // scale, dtype=torch.float64) + 0.5) * scale - 0.5

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.camera import Camera
+from dsr.utils.compute_device import constant
 
 LUMA = (0.299, 0.587, 0.114)  # weights of red, green and blue in the luma (ITU-R BT.601)
 _IMAGENET_MEAN, _IMAGENET_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -29,12 +30,14 @@ def exporting() -> bool:
 
 def grey(rgb: Tensor, weights: Sequence[float] = LUMA) -> Tensor:
     """Return the weighted sum of the channels of (B, 3, H, W) images, by default the luma, (B, 1, H, W)."""
-    return (rgb * rgb.new_tensor(weights)[:, None, None]).sum(dim=1, keepdim=True)
+    return (rgb * constant(tuple(weights), rgb.dtype, rgb.device)[:, None, None]).sum(dim=1, keepdim=True)
 
 
 def normalise_imagenet(rgb: Tensor) -> Tensor:
     """Return images, (B, 3, H, W) in 0..1, minus the mean colour of ImageNet, divided by its standard deviation."""
-    mean, deviation = (rgb.new_tensor(values).view(3, 1, 1) for values in (_IMAGENET_MEAN, _IMAGENET_DEVIATION))
+    mean, deviation = (
+        constant(values, rgb.dtype, rgb.device).view(3, 1, 1) for values in (_IMAGENET_MEAN, _IMAGENET_DEVIATION)
+    )
     return (rgb - mean) / deviation
 
 

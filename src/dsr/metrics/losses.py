@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from dsr.metrics.functional import SSIM_WINDOW, SurfacePair, dssim_v, mse_v
 from dsr.metrics.lpips import GET_TRUNK, LPIPS, MIN_SIZE, load_lpips, lpips_v
-from dsr.utils.compute_device import in_own_precision, known_true
+from dsr.utils.compute_device import in_own_precision, known_true, made_once
 from dsr.utils.console import one_line
 
 VisualLossName = Literal["mse_v", "dssim", "lpips"]
@@ -93,15 +93,13 @@ def _blur(level: Tensor, size: Sequence[int]) -> Tensor:
     return functional.conv_transpose2d(level, kernel, stride=2, padding=2, output_padding=extra)
 
 
-@functools.lru_cache(maxsize=64)
-@torch.inference_mode(mode=False)  # so that gradients can be computed with them
+@made_once
 def _blurred_ones(size: Sequence[int], larger: Sequence[int], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return what normalises :func:`_blur`, (1, 1, *larger)."""
     return _blur(torch.ones(1, 1, *size, dtype=dtype, device=device), larger)
 
 
-@functools.cache
-@torch.inference_mode(mode=False)
+@made_once
 def _kernel(dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return the binomial kernel, (1, 1, 5, 5)."""
     taps = torch.tensor((1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16), dtype=dtype, device=device)

@@ -72,7 +72,7 @@ class PatchData(lightning.LightningDataModule):
         validation: more data sets to validate with, by name; their scenes without a true depth are left out.
         everything: the distribution of degradations to train on in place of ``degradation``.
         patches_per_step: of all devices and batches of a step; None for those of one batch.
-        device: the device of the training, which ``settings`` of ``auto`` depend on.
+        device: what ``auto`` in ``settings`` depends on where there is no trainer yet.
 
     """
 
@@ -130,11 +130,11 @@ class PatchData(lightning.LightningDataModule):
             [derived(scene, depth=scene.true_depth.float()) for scene in map(source.load, names)]
             for source, names in self.trained
         ]
-        kind = Patches
+        patches = Patches
         if self._makes_patches(made_by_workers(self._degradation, self._everything)):
             holed = any(bool(scene.true_depth.isnan().any()) for group in groups for scene in group)
-            kind = DevicePatches if self._makes_patches("a true depth with holes" if holed else "") else Patches
-        self._cut = kind(
+            patches = DevicePatches if self._makes_patches("a true depth with holes" if holed else "") else Patches
+        self._cut = patches(
             groups, self.patches, self._degradation, shares=self._shares, seed=self._seed, everything=self._everything,
             per_step=self._per_step,
         )  # fmt: skip
@@ -145,12 +145,15 @@ class PatchData(lightning.LightningDataModule):
             self.held_out[kind] = (source, [scene.name for scene in known])
             self._validation.append(known)
 
+    def _training_device(self) -> torch.device:
+        return self._device if self.trainer is None else self.trainer.strategy.root_device
+
     def _makes_patches(self, left_to_workers: str) -> bool:
         """Return whether the training's device makes the patches; a ValueError if it is to make what it cannot."""
         wanted = self.patches.on_device
         if left_to_workers and wanted is True:
             raise ValueError(f"on_device: expected false or auto, {left_to_workers} is left to workers")
-        return not left_to_workers and (wanted is True or (wanted == "auto" and self._device.type != "cpu"))
+        return not left_to_workers and (wanted is True or (wanted == "auto" and self._training_device().type != "cpu"))
 
     def first_patches(self, count: int) -> list[Batch]:
         """Return the first ``count`` patches of the run."""
@@ -179,10 +182,9 @@ class PatchData(lightning.LightningDataModule):
         collate = functools.partial(_collate_prepared, prepare) if prepare else None
         workers = self.patches.workers
         if workers == "auto":
-            workers = 0 if self._device.type == "cpu" else max(1, len(os.sched_getaffinity(0)) - 1)
+            workers = 0 if self._training_device().type == "cpu" else max(1, (os.cpu_count() or 1) - 1)
         if isinstance(self._cut, DevicePatches):
-            root = self._device if self.trainer is None else self.trainer.strategy.root_device
-            self._cut.store(root)
+            self._cut.store(self._training_device())
             collate, workers = self._cut.collate, 0
         return _PatchLoader(
             self._cut,

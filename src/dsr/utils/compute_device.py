@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ParamSpec, TypeVar
 
 import torch
@@ -49,6 +49,27 @@ def in_own_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
             return function(*map(widened, given), **widened(named))
 
     return computed
+
+
+def made_once(make: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Keep the constants that a function makes: no step waits for their copy to a GPU, and a graph may contain them.
+
+    Gradients can be computed with them, also where they were first asked for in inference mode.
+    """
+    kept = functools.lru_cache(64)(torch.inference_mode(mode=False)(make))
+
+    @torch.compiler.assume_constant_result
+    @functools.wraps(make)
+    def get(*given: _P.args, **named: _P.kwargs) -> _R:
+        return kept(*given, **named)
+
+    return get
+
+
+@made_once
+def constant(values: Sequence[float], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return numbers, a tuple, as a tensor, (n,)."""
+    return torch.tensor(values, dtype=dtype, device=device)
 
 
 def known_true(flags: Tensor) -> bool:

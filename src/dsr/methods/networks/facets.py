@@ -20,6 +20,7 @@ from dsr.degradation.downsampling import check_scale
 from dsr.methods.images import exporting, pad_to_multiple
 from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, mix_planes, stencil
 from dsr.methods.networks.network import NormalisedNetwork
+from dsr.utils.compute_device import constant
 
 FULL, HALF = 16, 32  # channels of the photo's features at the full and at half the resolution
 HEAD = 24  # channels of the layers that choose the planes, at the full resolution
@@ -83,8 +84,8 @@ class Facets(NormalisedNetwork):
         batch, _, height, width = output.shape
         moves, picks = output.split((3 * self.facets, 6), dim=1)
         picks = picks.unflatten(1, (2, 3))
-        first = picks.new_tensor([0.0, 2.0, 0.0])[:, None, None]  # mostly the central difference at first
-        picks = (picks + first).softmax(dim=2)
+        central = constant((0.0, 2.0, 0.0), picks.dtype, picks.device)  # mostly this difference at first
+        picks = (picks + central[:, None, None]).softmax(dim=2)
         slopes = (picks * around.slopes).sum(dim=2)  # (B, 2, h, w)
         base = torch.cat((around.value, slopes), dim=1)[:, None]
         planes = base + moves.view(batch, self.facets, 3, height, width) * around.bend[:, None]

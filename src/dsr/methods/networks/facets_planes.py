@@ -4,7 +4,6 @@ A plane is its value at the centre of a low-resolution pixel and its two slopes 
 axis but two: (B, facets, 3, h, w). Everything here reproduces planes exactly.
 """
 
-import functools
 import itertools
 import math
 from typing import Any, NamedTuple
@@ -15,6 +14,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from dsr.methods.images import exporting, extend_linearly
+from dsr.utils.compute_device import made_once
 
 NEIGHBOURS = 9  # low-resolution pixels whose planes are mixed or averaged: 3 x 3
 _CHUNK = 2**17  # values that a processor's cache holds several of
@@ -113,7 +113,10 @@ class _AveragePlanes(torch.autograd.Function):
 
 def _repeat_border(planes: Tensor, reach: int) -> Tensor:
     """Return planes, (B, facets, 3, h, w), with those of the border in place of those beyond it."""
-    padded = functional.pad(planes.flatten(1, 2), (reach,) * 4, mode="replicate")
+    flat = planes.flatten(1, 2)
+    if torch.compiler.is_compiling():  # torch 2.13 expects this layout of the gradient
+        flat = flat.contiguous()
+    padded = functional.pad(flat, (reach,) * 4, mode="replicate")
     return padded.unflatten(1, planes.shape[1:3])
 
 
@@ -138,8 +141,7 @@ def _distances(near: Tensor, reach: int) -> tuple[Tensor, Tensor]:
     return down[:, None, :, None], across[:, None]
 
 
-@functools.lru_cache(64)
-@torch.inference_mode(mode=False)  # so that gradients can be computed with it
+@made_once
 def _distances_along(size: int, reach: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     places = torch.arange(size, dtype=dtype, device=device)
     return torch.stack((places, torch.zeros_like(places), -places.flip(0))).clamp(-reach, reach)
@@ -170,8 +172,7 @@ def mix_planes(planes: Tensor, found: Tensor, scale: int) -> tuple[Tensor, Tenso
         return base + functional.pixel_shuffle(mixed.unflatten(2, (height, width)), scale), found[:, count:].to(dtype)
 
 
-@functools.lru_cache(64)
-@torch.inference_mode(mode=False)  # so that gradients can be computed with them
+@made_once
 def _mixing_constants(scale: int, facets: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """Return factors of value and slopes at high-resolution pixels, (s s, 3), and B-spline logits, (9 f, s s, 1)."""
     # from the centre of the low-resolution pixel, in low-resolution pixels

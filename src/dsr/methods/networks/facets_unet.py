@@ -8,7 +8,6 @@ et al., *CondConv*, NeurIPS 2019). Where the kernel is known, the residual is ad
 1991). Maps of the photo's own size have the weights of factor 2. Disparity is divided by its median.
 """
 
-import functools
 import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -36,6 +35,7 @@ from dsr.methods.networks.facets import (
 )
 from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, average_planes, mix_planes, smooth, stencil
 from dsr.methods.networks.network import Answer, DisparityNetwork, expect_rgb_size
+from dsr.utils.compute_device import constant
 from dsr.utils.progress import Steps
 
 # layers at the low resolution
@@ -292,13 +292,6 @@ class FacetsUNet(DisparityNetwork):
         return planes
 
 
-@functools.lru_cache(64)
-@torch.inference_mode(mode=False)  # so that gradients can be computed with it
-def _constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return numbers as a tensor, (n,), which is made once, so that no step waits for its copy to a GPU."""
-    return torch.tensor(values, dtype=dtype, device=device)
-
-
 def _join(bands: Sequence[Tensor]) -> Tensor:
     """Return bands of rows as one map; a single one as it is."""
     return bands[0] if len(bands) == 1 else torch.cat(list(bands), dim=-2)
@@ -307,7 +300,7 @@ def _join(bands: Sequence[Tensor]) -> Tensor:
 def _favour(logits: Tensor, index: int) -> Tensor:
     """Return logits of (B, facets, ..., n, h, w) with 2 added to one of the n."""
     added = tuple(2.0 * (i == index) for i in range(logits.shape[-3]))
-    return logits + _constant(added, logits.dtype, logits.device)[:, None, None]
+    return logits + constant(added, logits.dtype, logits.device)[:, None, None]
 
 
 def _pair_up(values: Tensor, weight: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -333,6 +326,7 @@ def _lr_input(around: Stencil, weight: Tensor, noise: Tensor, hints: Tensor) -> 
     return torch.cat(parts, dim=1)
 
 
+@torch.compiler.disable  # whose indices differ from step to step
 def _project(result: Tensor, values: Tensor, known: Tensor, gate: Tensor, kernels: Sequence[str | None]) -> Tensor:
     """Return results closer to what was measured, where the kernel is known."""
     scale = result.shape[-1] // values.shape[-1]
@@ -344,7 +338,7 @@ def _project(result: Tensor, values: Tensor, known: Tensor, gate: Tensor, kernel
             if len(images) == len(kernels):
                 seen = model(result, scale, complete=True)
             else:
-                index = _constant(tuple(images), torch.int64, result.device)
+                index = constant(tuple(images), torch.int64, result.device)
                 seen = seen.index_copy(0, index, model(result[index], scale, complete=True))
         residual = torch.where(known, values - seen, 0)
         result = result + gate.to(result.dtype) * upsample_bicubic(residual, scale)
@@ -364,7 +358,7 @@ def _roughness(bend: Tensor, weight: Tensor) -> Tensor:
     values = bend.float().flatten(2).flatten(0, 1)  # of pixels, a row for each level and image
     known = known.flatten(1).repeat(1 + _LEVELS, 1)
     ordered, count = torch.where(known, values, torch.inf).sort(dim=1).values, known.sum(dim=1, keepdim=True)
-    place = _constant(_QUANTILES, torch.float32, bend.device) * (count - 1).clamp(min=0).to(values.dtype)
+    place = constant(_QUANTILES, torch.float32, bend.device) * (count - 1).clamp(min=0).to(values.dtype)
     below, above = place.floor().long(), place.ceil().long()
     quantiles = torch.lerp(ordered.gather(1, below), ordered.gather(1, above), place - below.to(values.dtype))
     quantiles = torch.where(count > 0, quantiles, torch.nan)

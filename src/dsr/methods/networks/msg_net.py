@@ -20,6 +20,7 @@ from torch.nn import functional
 from dsr.degradation.downsampling import check_scale
 from dsr.methods.images import LUMA, compute_min_max, inpaint, mean3x3, normalise, upsample_bicubic
 from dsr.methods.networks.network import DisparityNetwork, expect_rgb_size
+from dsr.utils.compute_device import constant
 from dsr.utils.guards import expect_one_of
 
 VariantName = Literal["hui", "voynov", "dsr"]
@@ -40,19 +41,17 @@ class ConvLayer(nn.Module):
 
     def __init__(self, conv: nn.Conv2d | nn.ConvTranspose2d, slopes: int) -> None:
         super().__init__()
-        self.conv = conv
+        self.conv, self.slopes = conv, slopes
         self.activation = nn.PReLU(slopes) if slopes else nn.Identity()
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, C_in, H, W) to (B, C_out, H', W')."""
         x = self.conv(x)
-        if isinstance(self.activation, nn.PReLU) and self.activation.num_parameters == 1:
-            # In place, to save memory, but only in inference mode, where no gradient can be requested.
-            if torch.is_inference(x):
-                return functional.leaky_relu_(x, float(self.activation.weight))
-            if x.device.type == "cpu":
-                return _SharedPReLU.apply(x, self.activation.weight)
-        return self.activation(x)
+        if x.device.type != "cpu" or torch.compiler.is_compiling() or self.slopes != 1:
+            return self.activation(x)
+        if torch.is_inference(x):  # in place, to save memory, but only here, where no gradient can be requested
+            return functional.leaky_relu_(x, float(self.activation.weight))
+        return _SharedPReLU.apply(x, self.activation.weight)
 
 
 class _SharedPReLU(torch.autograd.Function):
@@ -102,7 +101,8 @@ def guidance_map(
 def intensity_of(rgb: Tensor, variant: VariantName) -> Tensor:
     """Return the intensity of an image, (B, 1, H, W) in 0..255."""
     weights, offset = _INTENSITY[variant]
-    return ((255 * rgb * rgb.new_tensor(weights)[:, None, None]).sum(-3, keepdim=True) + offset).clip(0, 255)
+    factors = constant(weights, rgb.dtype, rgb.device)[:, None, None]
+    return ((255 * rgb * factors).sum(-3, keepdim=True) + offset).clip(0, 255)
 
 
 class MSGNet(DisparityNetwork):
