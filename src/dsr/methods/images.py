@@ -121,6 +121,8 @@ def pad_to_multiple(x: Tensor, factor: int) -> Tensor:
     """Repeat the last row and column of (B, C, h, w) so that both sizes become multiples of ``factor``."""
     height, width = x.shape[-2:]
     if not exporting():
+        if width % factor == height % factor == 0:
+            return x
         return functional.pad(x, (0, -width % factor, 0, -height % factor), mode="replicate")
     more = functional.pad(x, (0, factor - 1, 0, factor - 1), mode="replicate")
     rows, columns = (factor * ((n + factor - 1) // factor) for n in (height, width))

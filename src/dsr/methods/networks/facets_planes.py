@@ -113,11 +113,13 @@ class _AveragePlanes(torch.autograd.Function):
 
 def _repeat_border(planes: Tensor, reach: int) -> Tensor:
     """Return planes, (B, facets, 3, h, w), with those of the border in place of those beyond it."""
-    flat = planes.flatten(1, 2)
-    if torch.compiler.is_compiling():  # torch 2.13 expects this layout of the gradient
-        flat = flat.contiguous()
-    padded = functional.pad(flat, (reach,) * 4, mode="replicate")
-    return padded.unflatten(1, planes.shape[1:3])
+    if not torch.compiler.is_compiling():
+        padded = functional.pad(planes.flatten(1, 2), (reach,) * 4, mode="replicate")
+        return padded.unflatten(1, planes.shape[1:3])
+    for dim in (-2, -1):  # torch 2.13 compiles the gradient of that with another layout than it has
+        first, last = planes.narrow(dim, 0, 1), planes.narrow(dim, planes.shape[dim] - 1, 1)
+        planes = torch.cat((*[first] * reach, planes, *[last] * reach), dim=dim)
+    return planes
 
 
 def _extend_to_centre(padded: Tensor, size: torch.Size, reach: int) -> Tensor:
