@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from dsr.degradation.sensors import SENSORS, identify, least_error, recognise, recognise_values
+from dsr.degradation.sensors import SENSORS, Identified, identify, recognise, recognise_values
 from dsr.geometry.camera import Camera
 from dsr.inference import find_sensor, upsample_surface
 from dsr.inference.working_size import find_noise
@@ -61,6 +61,10 @@ def test_page_has_the_table():
             stated = [tuple(map(float, pair.split(" at "))) for pair in cell.split(", ") if pair]
             assert stated == [(pytest.approx(1000 * figure), distance) for distance, figure in figures_at or ()]
         assert recognise(name) is sensor
+
+
+def least_error(camera, depth):
+    return Identified(camera, "request").least_error(depth)
 
 
 def test_least_error_is_that_of_the_disparity():
