@@ -182,7 +182,7 @@ def test_depth_step_is_the_least_squares_solution(holes, mask):
     free = problem.inside.flatten().numpy()
     expected = before.copy()
     expected[free] = np.linalg.lstsq(matrix[:, free], right - matrix[:, ~free] @ before[~free], rcond=None)[0]
-    solver.update_depth()
+    solver.update_depth(1.3)
     np.testing.assert_allclose(solver.z.flatten().numpy(), expected, rtol=0, atol=1e-4 * expected.std())
 
 
@@ -221,8 +221,7 @@ def test_batch_equals_its_problems_one_at_a_time():
         for _ in range(2):
             solver.update_lighting()
             solver.update_theta()
-            solver.update_depth()
-            solver.update_missed(1.3)
+            solver.update_depth(1.3)
     torch.testing.assert_close(together.z, torch.cat([solver.z for solver in solvers]), rtol=1e-5, atol=0)
 
 

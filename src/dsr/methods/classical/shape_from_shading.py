@@ -169,8 +169,8 @@ class ShadingSolver:
             self.theta, energy = torch.where(better, near, self.theta), torch.where(better, lower, energy)
             self._damping = (self._damping * torch.where(better, _LESS, _MORE)).clamp(1e-6, 1e6)
 
-    def update_depth(self) -> None:
-        """Lower the Lagrangian, which is quadratic in z, by conjugate gradients from the current z."""
+    def update_depth(self, growth: float) -> None:
+        """Lower the Lagrangian in z by conjugate gradients; then update the multiplier, and multiply the penalty."""
 
         def curvature(z: Tensor) -> Tensor:  # the second derivative in z, times z; 0 outside the mask
             inside = self._weight * z
@@ -184,9 +184,6 @@ class ShadingSolver:
             + self.penalty * self.slopes.adjoint(self.coupling * wanted)
         )
         self.z = self.z + conjugate_gradients(curvature, right, _CG_ITERATIONS, _CG_TOLERANCE)
-
-    def update_missed(self, growth: float) -> None:
-        """Add (p, q, z) - theta to the multiplier, and multiply the penalty."""
         self.missed = (self.missed + self.slopes(self.z) - self.theta) / growth
         self.penalty *= growth
 
@@ -357,8 +354,7 @@ class ShapeFromShading(Method):
             solver.update_albedo(anew=done % _RENEW == 1)
             solver.update_lighting()
             solver.update_theta()
-            solver.update_depth()
-            solver.update_missed(self.growth)
+            solver.update_depth(self.growth)
             theta = solver.slopes(solver.z)
             terms = solver.terms(theta)
             objective = sum(terms.values())
