@@ -244,8 +244,10 @@ class ShadingSolver:
     def _energies(self, albedo: Tensor, shading: Tensor, regions: Regions | None) -> tuple[float, float]:
         """Return the terms of E for the shading and for the albedo's boundaries, 0 without regions."""
         shaded = 0.5 * float((self._weight * (albedo * shading - self.problem.rgb).square()).sum())
-        length = 0 if regions is None else boundary_length(regions, self.problem.inside)
-        return shaded, self.problem.boundary_weight * length
+        if regions is None:
+            return shaded, 0.0
+        borders = _find_borders(regions.labels, self.problem.inside)
+        return shaded, self.problem.boundary_weight * int((borders.one != borders.other).sum())
 
 
 def _chain_to_theta(by_m: Tensor, rays: Tensor) -> Tensor:
@@ -471,12 +473,6 @@ def fit_albedo(rgb: Tensor, shading: Tensor, regions: Regions) -> Tensor:
         for each in (shading.square(), shading * rgb)
     )
     return _best_albedo(squares, products)[regions.labels].movedim(-1, 1)
-
-
-def boundary_length(regions: Regions, inside: Tensor) -> int:
-    """Return the number of pairs of neighbours in different regions, both inside the mask (B, 1, H, W)."""
-    borders = _find_borders(regions.labels, inside)
-    return int((borders.one != borders.other).sum())
 
 
 def _best_albedo(squares: Tensor, products: Tensor) -> Tensor:
