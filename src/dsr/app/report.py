@@ -23,8 +23,7 @@ from dsr.utils.files import expect_target, replacing_folder, write_text
 from dsr.utils.progress import Progress
 from dsr.utils.ratios import as_ratio
 
-_MARK = "report.json"
-"""A file that marks a directory as a report, which a new one may replace."""
+_MARK = "report.json"  # a file that marks a directory as a report, which a new one may replace
 _FEW = 24  # predictions below which the start of worker processes takes longer than they save
 _MOST = 8  # workers unless more are requested; each needs about 0.5 GB
 _MAIN = {

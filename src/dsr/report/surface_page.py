@@ -30,29 +30,24 @@ from dsr.report.html_page import asset, fill, json_text, palette, policy
 from dsr.utils.files import write_text
 from dsr.utils.guards import opened
 
-MARK = '<meta name="generator" content="dsr view">'
-"""What a page begins with that a new one may replace."""
+MARK = '<meta name="generator" content="dsr view">'  # what a page begins with that a new one may replace
 _SCRIPTS = ("core.js", "decode.js", "mesh.js", "webgl.js", "pose.js", "view.js")
 _COLOURS = "magma"
-ANGLES = (1.0, 60.0)
-"""Ends of the colours of the normals' expected errors in degrees, those of ``confidence.png``."""
+ANGLES = (1.0, 60.0)  # ends of the colours of the normals' expected errors in degrees, those of ``confidence.png``
+# Ends of the colours of the depths' expected errors as fractions of the median depth, those of ``confidence.png``
 DEPTHS = (1e-3, 1e-1)
-"""Ends of the colours of the depths' expected errors as fractions of the median depth, those of ``confidence.png``."""
+# Longer sides of the pictures for browsers without WebGL and of those to choose from, pixels
 _STATIC, _THUMB = 640, 160
-"""Longer sides of the pictures for browsers without WebGL and of those to choose from, pixels."""
 _QUALITY = 85
+# Which pixels of an (h, w) map are joined: with their right neighbours, (h, w - 1), and those below, (h - 1, w)
 Joints = tuple[np.ndarray, np.ndarray]
-"""Which pixels of an (h, w) map are joined: with their right neighbours, (h, w - 1), and those below, (h - 1, w)."""
 
-LEVELS = 2**24 - 1
-"""Highest level of inverse depth; 1 is the lowest, 0 is a hole."""
-ERROR_LEVELS = 255
-"""Highest level of an error; 1 is the lowest, 0 is unknown."""
+LEVELS = 2**24 - 1  # highest level of inverse depth; 1 is the lowest, 0 is a hole
+ERROR_LEVELS = 255  # highest level of an error; 1 is the lowest, 0 is unknown
+# Flags of a pixel: joined to its right neighbour and to the one below, without and with doubtful pixels; doubtful; not
+# measured
 RIGHT, BELOW, RIGHT_WITH_DOUBTFUL, BELOW_WITH_DOUBTFUL, DOUBTFUL, FILLED = 1, 2, 4, 8, 16, 32
-"""Flags of a pixel: joined to its right neighbour and to the one below, without and with doubtful pixels; doubtful;
-not measured."""
-_STRIP = 1 << 20
-"""Pixels whose joints are looked for at a time."""
+_STRIP = 1 << 20  # pixels whose joints are looked for at a time
 
 
 @dataclass(frozen=True)
