@@ -252,7 +252,20 @@ def find_joints(depth: np.ndarray, factor: int) -> Joints:
     Two neighbouring blocks are joined if at least half of the rows (or columns) have no cut between the middles of the
     two. Cuts found in the reduced map would be too many: the larger the pixels, the more a surface bends between them.
     """
-    return _joined_along(depth, factor), _joined_along(depth.T, factor).T
+    joints = []
+    for lines in (depth, depth.T):
+        height, width = lines.shape[0] // factor, lines.shape[1] // factor
+        joined = np.empty((height, width - 1), bool)
+        rows = max(1, _STRIP // (lines.shape[1] * factor))
+        for start in range(0, height, rows):
+            stop = min(start + rows, height)
+            across, _ = find_connections(1 / lines[start * factor : stop * factor].astype(np.float64))
+            broken = np.pad(np.cumsum(~across, axis=1), ((0, 0), (1, 0)))  # number of cuts left of each pixel
+            middles = factor // 2 + factor * np.arange(width)
+            whole = broken[:, middles[1:]] == broken[:, middles[:-1]]
+            joined[start:stop] = 2 * whole.reshape(stop - start, factor, width - 1).sum(axis=1) >= factor
+        joints.append(joined)
+    return joints[0], joints[1].T
 
 
 def pack_grid(grid: Grid) -> tuple[dict[str, Any], str]:
@@ -304,18 +317,3 @@ def _flags(grid: Grid) -> np.ndarray:
         flags[:, :-1] |= np.where(across & there[:, 1:] & there[:, :-1], right, 0).astype(np.uint8)
         flags[:-1] |= np.where(down & there[1:] & there[:-1], below, 0).astype(np.uint8)
     return flags
-
-
-def _joined_along(depth: np.ndarray, factor: int) -> np.ndarray:
-    """Return which blocks of a map, (H, W), are joined with their right neighbours."""
-    height, width = depth.shape[0] // factor, depth.shape[1] // factor
-    joined = np.empty((height, width - 1), bool)
-    rows = max(1, _STRIP // (depth.shape[1] * factor))
-    for start in range(0, height, rows):
-        stop = min(start + rows, height)
-        across, _ = find_connections(1 / depth[start * factor : stop * factor].astype(np.float64))
-        broken = np.pad(np.cumsum(~across, axis=1), ((0, 0), (1, 0)))  # number of cuts left of each pixel
-        middles = factor // 2 + factor * np.arange(width)
-        whole = broken[:, middles[1:]] == broken[:, middles[:-1]]
-        joined[start:stop] = 2 * whole.reshape(stop - start, factor, width - 1).sum(axis=1) >= factor
-    return joined
