@@ -22,7 +22,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
 from omegaconf import OmegaConf
 from rich.console import Console
 
@@ -34,7 +33,7 @@ from dsr.io.pairs import PHOTO_SUFFIXES
 from dsr.methods.recipe import list_methods, read_recipe
 from dsr.utils.console import show
 from dsr.utils.guards import free_memory, refusing
-from dsr.utils.progress import megabytes, show_length
+from dsr.utils.progress import megabytes
 from dsr.utils.versions import how_to_install
 
 _PRIVATE = {"GRADIO_ANALYTICS_ENABLED": "False", "HF_HUB_OFFLINE": "1"}
@@ -44,7 +43,7 @@ _BETWEEN_LOOKS = 0.3  # seconds
 _KEPT = 3600  # seconds for which an upload is kept
 _UNITS = ["mm", "cm", "m", "1/5000", "1/1000", "1/10000", "sunrgbd"]
 _CHOICES = ("--depth-unit", "--range-type", "--baseline", "--fov", "--method", "--fill", "--smooth")
-_Shown = tuple[str, str, str, list[str] | None]  # what was said, the surfaces, the expected errors, and the files
+_Shown = tuple[str, str, list[str] | None]  # what was said, the surfaces, and the files
 _PAIR = ("--rgb", "--depth", "--camera", "--mask")
 
 
@@ -126,7 +125,7 @@ class Work:
             surfaces = f'<iframe title="the surfaces" sandbox="allow-scripts" srcdoc="{page}"></iframe>'
             archive = shutil.make_archive(str(result), "zip", place, result.name)
             meshes = [str(path) for path in sorted(result.rglob("mesh.*"))]
-            yield text, surfaces, _expected_errors(result), [archive, *meshes]
+            yield text, surfaces, [archive, *meshes]
 
     def stop(self) -> None:
         """End the process that is running."""
@@ -160,7 +159,7 @@ class Work:
                 resource.prlimit(process.pid, resource.RLIMIT_DATA, (memory, memory))
                 resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (_LARGEST_FILE, _LARGEST_FILE))
             while process.poll() is None:
-                yield before + self._said(place), "", "", None
+                yield before + self._said(place), "", None
                 if time.monotonic() > end:
                     limit = self.request.max_seconds
                     raise ValueError(f"it took more than {limit:g} s (--max-seconds), and was ended")
@@ -178,22 +177,6 @@ class Work:
         """Return what a command has said so far, without the folders of uploads and results."""
         text = (place / "said.txt").read_text(encoding="utf-8", errors="replace")
         return re.sub(rf"{re.escape(str(self._folder))}{os.sep}(uploads{os.sep})?[^{os.sep}\s]+{os.sep}", "", text)
-
-
-def _expected_errors(result: Path) -> str:
-    """Return a table of the expected errors of a result, in Markdown; nothing for a method that predicts none."""
-    path = next(result.rglob("confidence.npz"), None)
-    if path is None:
-        return ""
-    with np.load(path) as errors:
-        depth, angle = (
-            np.nanpercentile(errors[f"{name}_error"].astype(np.float32), (50, 90)) for name in ("depth", "angle")
-        )
-    return (
-        "| expected error | median | 90 % below |\n| --- | --- | --- |\n"
-        f"| depth | {show_length(depth[0], 2)} | {show_length(depth[1], 2)} |\n"
-        f"| normals | {angle[0]:.1f} degrees | {angle[1]:.1f} degrees |"
-    )
 
 
 def make_app(work: Work, path: str) -> Any:
@@ -229,7 +212,7 @@ def make_page(work: Work) -> Any:
             yield from work.compute(*given)
         except (ValueError, OSError) as error:
             gr.Warning(html.escape(str(error)), duration=None)
-            yield f"error: {error}", "", "", None
+            yield f"error: {error}", "", None
 
     ranges = ["orthogonal", "perspective", "disparity"]
     with gr.Blocks(title="dsr app", analytics_enabled=False, delete_cache=(_KEPT // 4, _KEPT), fill_width=True) as page:
@@ -257,7 +240,7 @@ def make_page(work: Work) -> Any:
                     cancel = gr.Button("Cancel", min_width=100)
                 said = gr.Textbox(label="What was read and done", lines=6, max_lines=20, interactive=False)
             with gr.Column(scale=3, min_width=320):
-                shown = gr.HTML(), gr.Markdown(), gr.File(label="Results", interactive=False, height=140)
+                shown = gr.HTML(), gr.File(label="Results", interactive=False, height=140)
         given = [capture, photo, depth, camera, mask, frame, unit, range_type, baseline, fov, method, fill, smooth]
         computing = go.click(compute, given, [said, *shown], concurrency_limit=1, api_visibility="private")
         cancel.click(None, cancels=computing)

@@ -29,6 +29,7 @@ from dsr.pictures.depth_views import reduced
 from dsr.report.html_page import asset, fill, json_text, palette, policy
 from dsr.utils.files import write_text
 from dsr.utils.guards import opened
+from dsr.utils.progress import show_length
 
 MARK = '<meta name="generator" content="dsr view">'  # what a page begins with that a new one may replace
 _SCRIPTS = ("core.js", "decode.js", "mesh.js", "webgl.js", "pose.js", "view.js")
@@ -100,7 +101,12 @@ def pack_result(result: ViewedResult, vertices: int, photo_side: int) -> Packed:
     if result.depth_lr is not None:
         maps["before"] = result.depth_lr
         grids["before"] = _reduce(result.depth_lr, result.camera, vertices)
-    about: dict[str, Any] = {"name": result.name, "facts": result.facts or {}, "notes": list(result.notes)}
+    facts = dict(result.facts or {})
+    if result.depth_error is not None and result.angle_error is not None:
+        depth, angle = (np.nanpercentile(each, (50, 90)) for each in (result.depth_error, result.angle_error))
+        facts["expected error of the depth"] = f"{show_length(depth[0], 2)}, 90 % below {show_length(depth[1], 2)}"
+        facts["expected error of the normals"] = f"{angle[0]:.1f} degrees, 90 % below {angle[1]:.1f}"
+    about: dict[str, Any] = {"name": result.name, "facts": facts, "notes": list(result.notes)}
     data = {}
     for name, grid in grids.items():
         about[name], data[name] = pack_grid(grid)
