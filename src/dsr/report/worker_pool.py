@@ -3,6 +3,7 @@
 import contextlib
 import os
 from collections.abc import Callable, Generator, Sequence
+from copy import copy
 from typing import TypeVar
 
 from dsr.evaluation.results import Results
@@ -22,7 +23,7 @@ class WorkerPool(contextlib.ExitStack):
         self._pool: Pool | None = None
         if workers > 1:
             threads = max(1, (os.cpu_count() or 1) // workers)
-            self._pool = self.enter_context(Pool(workers, _given, (results,), threads, say))
+            self._pool = self.enter_context(Pool(workers, copy, (results,), threads, say))
 
     def map(self, function: Callable[[Results, _Item], _Value], items: Sequence[_Item]) -> Generator[_Value]:
         """Return the values of ``function(results, item)``, of a module's function, in the order of the items.
@@ -32,8 +33,3 @@ class WorkerPool(contextlib.ExitStack):
         if self._pool is None:
             return (function(self.results, item) for item in items)
         return (value for _, value in self._pool.results(function, items, ordered=True))
-
-
-def _given(results: Results) -> Results:
-    """Return what a worker has got, the first argument of all that it calls."""
-    return results
