@@ -17,7 +17,7 @@ import subprocess
 import sys
 import time
 import webbrowser
-from collections.abc import Awaitable, Callable, Generator, Iterator
+from collections.abc import Awaitable, Callable, Generator, Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -42,9 +42,7 @@ _LARGEST_FILE = 8 << 30
 _BETWEEN_LOOKS = 0.3  # seconds
 _KEPT = 3600  # seconds for which an upload is kept
 _UNITS = ["mm", "cm", "m", "1/5000", "1/1000", "1/10000", "sunrgbd"]
-_CHOICES = ("--depth-unit", "--range-type", "--baseline", "--fov", "--method", "--fill", "--smooth")
 _Shown = tuple[str, str, list[str] | None]  # what was said, the surfaces, and the files
-_PAIR = ("--rgb", "--depth", "--camera", "--mask")
 
 
 def browse(request: BrowserRequest, console: Console) -> list[str]:
@@ -97,17 +95,12 @@ class Work:
         self.request, self._folder = request, folder
         self.process: subprocess.Popen[bytes] | None = None
 
-    def compute(self, *given: Any) -> Iterator[_Shown]:
-        """Upsample a photo's depth map, or a frame of a capture; yield what to show.
-
-        Given are the paths of a capture, a photo, a depth map, a camera and a mask, the number of the capture's frame
-        from 1, and the values of ``_CHOICES``; empty or None for what is missing.
-        """
-        capture, frame, pair = given[0], given[5], dict(zip(_PAIR, given[1:5], strict=True))
-        if bool(capture) == bool(pair["--rgb"] and pair["--depth"]):
+    def compute(self, capture: str | None, frame: int, options: Mapping[str, str | None]) -> Iterator[_Shown]:
+        """Upsample a photo's depth map, or a frame of a capture, numbered from 1; yield what to show."""
+        given = {flag: value for flag, value in options.items() if value}
+        if bool(capture) == ({"--rgb", "--depth"} <= given.keys()):
             raise ValueError("expected a photo and a depth map, or a capture")
-        options = {**pair, **dict(zip(_CHOICES, given[6:], strict=True))}
-        arguments = [f"{flag}={value}" for flag, value in options.items() if value not in (None, "")]
+        arguments = [f"{flag}={value}" for flag, value in given.items()]
         with TemporaryDirectory(dir=self._folder) as place:
             result = Path(place) / "dsr-result"
             upsample = "upsample", f"--output={result.name}"
@@ -207,9 +200,9 @@ def make_page(work: Work) -> Any:
     def file(label: str, *suffixes: str) -> gr.File:
         return gr.File(label=label, file_types=list(suffixes), height=120)
 
-    def compute(*given: Any) -> Iterator[Any]:
+    def compute(capture: str | None, frame: int, *given: str | None) -> Iterator[Any]:
         try:
-            yield from work.compute(*given)
+            yield from work.compute(capture, frame, dict(zip(options, given, strict=True)))
         except (ValueError, OSError) as error:
             gr.Warning(html.escape(str(error)), duration=None)
             yield f"error: {error}", "", None
@@ -241,7 +234,11 @@ def make_page(work: Work) -> Any:
                 said = gr.Textbox(label="What was read and done", lines=6, max_lines=20, interactive=False)
             with gr.Column(scale=3, min_width=320):
                 shown = gr.HTML(), gr.File(label="Results", interactive=False, height=140)
-        given = [capture, photo, depth, camera, mask, frame, unit, range_type, baseline, fov, method, fill, smooth]
+        options = {
+            "--rgb": photo, "--depth": depth, "--camera": camera, "--mask": mask, "--depth-unit": unit, "--fov": fov,
+            "--range-type": range_type, "--baseline": baseline, "--method": method, "--fill": fill, "--smooth": smooth,
+        }  # fmt: skip
+        given = [capture, frame, *options.values()]
         computing = go.click(compute, given, [said, *shown], concurrency_limit=1, api_visibility="private")
         cancel.click(None, cancels=computing)
     return page
