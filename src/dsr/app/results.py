@@ -28,7 +28,7 @@ from dsr.geometry.poses import PosedMap, as_rigid, check_poses
 from dsr.io.exports import INPUT, read_input, world_comment, write_ply
 from dsr.io.images import read_pixels
 from dsr.io.scene_files import RGBD
-from dsr.notes import expect_no_warning
+from dsr.notes import Assumption, expect_no_warning
 from dsr.report.surface_page import Packed, is_view, pack_result, save_view
 from dsr.utils.console import ConsoleProgress, one_line, show
 from dsr.utils.files import expect_target
@@ -102,11 +102,11 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
     frames = sorted(itertools.chain(*recordings.values()), key=natural_key)
     if not frames:
         raise ValueError(f"expected results of `dsr upsample` with poses; {problems[0]}")
-    faults = (
-        check_poses(len(recording), lambda number, own=recording: _load(own[number], max_error))
-        for recording in recordings.values()
-    )
-    warnings = [each for each in dict.fromkeys(faults) if each is not None]
+
+    def fault(recording: Sequence[Path]) -> Assumption | None:
+        return check_poses(len(recording), lambda number: _load(recording[number], max_error))
+
+    warnings = [each for each in dict.fromkeys(map(fault, recordings.values())) if each is not None]
     if request.strict:
         expect_no_warning(str(request.folders[0]), warnings)
     for each in warnings:
