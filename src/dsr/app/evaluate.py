@@ -312,18 +312,19 @@ def _evaluate_scenes(prepared: _Prepared, study: Evaluation, progress: Progress)
                 if workers > 1 and needed > _WORTH_WORKERS:
                     break
     if left:
-        with Pool(min(workers, len(left)), _begin, (prepared, since), threads, progress.say) as pool:
-            results = _in_workers(pool, left)
+        with Pool(min(workers, len(left)), _begin, (prepared,), threads, progress.say) as pool:
+            results = _in_workers(pool, left, since)
             for scene, result in progress.track(results, "evaluate", len(scenes), done=len(found), label=itemgetter(0)):
                 found[scene] = result
     return {scene: found[scene] for scene in scenes}
 
 
-def _in_workers(pool: Pool, left: list[str]) -> Iterator[tuple[str, SceneResult]]:
+def _in_workers(pool: Pool, left: list[str], since: float) -> Iterator[tuple[str, SceneResult]]:
     """Yield the scenes with their results; those that other commands work on come last."""
     try:
         for wait in (False, True):
-            for scene, result in pool.results(functools.partial(_in_worker, wait), tuple(left)):
+            evaluate_one = functools.partial(_in_worker, wait=wait, since=since)
+            for scene, result in pool.results(evaluate_one, tuple(left)):
                 if result is not None:
                     left.remove(scene)
                     yield scene, result
@@ -331,21 +332,15 @@ def _in_workers(pool: Pool, left: list[str]) -> Iterator[tuple[str, SceneResult]
         yield from ((scene, SceneResult(failure=f"{scene}: {error}")) for scene in left)
 
 
-_worker: tuple[Evaluation, float] | None = None  # of this process, if it is a worker
-
-
-def _begin(prepared: _Prepared, since: float) -> None:
+def _begin(prepared: _Prepared) -> Evaluation:
     """Prepare a worker, which repeats no note of its parent."""
-    global _worker  # noqa: PLW0603 - the process's own
     _seed(prepared.settings.seed)
     with contextlib.redirect_stderr(io.StringIO()):
-        _worker = _study(prepared, _method(prepared, SILENT)), since
+        return _study(prepared, _method(prepared, SILENT))
 
 
-def _in_worker(wait: bool, scene: str) -> SceneResult | None:
+def _in_worker(study: Evaluation, scene: str, *, wait: bool, since: float) -> SceneResult | None:
     """Evaluate a scene in a worker; None if another process works on it, unless its end is waited for."""
-    assert _worker is not None  # noqa: S101 - workers begin with _begin
-    study, since = _worker
     for _ in free_first(study.folder, [scene], wait=wait):
         return evaluate_scene(study, scene, since)
     return None
