@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from depth_steps import pair_of
-from reference_metrics import LIGHTS, Intrinsics, Reference
+from reference_metrics import LIGHTS, Intrinsics, normals_of
 from scipy import ndimage
 from skimage.metrics import structural_similarity
 
@@ -45,7 +45,7 @@ def _reference(prediction, truth):
     median = np.median(truth[known])
     maps = [np.where(np.isfinite(z), z, median) for z in (prediction - offset, truth)]
     rays = Intrinsics(CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy).rays(*truth.shape)
-    first, second = (Reference._normals(z[..., None] * rays) for z in maps)
+    first, second = (normals_of(z[..., None] * rays) for z in maps)
     renderings = [np.clip(np.einsum("lc,hwc->lhw", LIGHTS, n), 0, 1) for n in (first, second)]
     similar = [structural_similarity(x, y, data_range=2, full=True)[1] for x, y in zip(*renderings, strict=True)]
     angle = np.degrees(np.arccos(np.clip((first * second).sum(axis=-1), -1, 1)))[scored]
