@@ -186,6 +186,12 @@ def test_auto_is_the_device_of_the_environment(monkeypatch, gpu):
         pick_device("auto")
 
 
+@pytest.mark.parametrize("name", ["gpu", "cuda:99", "meta", "", "cpu:x"])
+def test_device_that_this_machine_lacks_is_refused(name):
+    with pytest.raises(ConfigError, match=r"^device: expected auto, cpu or a device of this machine, got "):
+        pick_device(name)
+
+
 @pytest.mark.parametrize(
     ("avx", "amx", "expected"), [(False, False, "float32"), (True, False, "bfloat16"), (True, True, "bfloat16")]
 )

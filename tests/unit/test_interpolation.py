@@ -33,11 +33,6 @@ def _random(seed=0):
     return torch.from_numpy(np.random.default_rng(seed).uniform(1.0, 3.0, (32, 48)))
 
 
-def _ramp():
-    v, u = np.mgrid[:32, :48]
-    return torch.from_numpy(2 + 0.03 * u - 0.02 * v)
-
-
 def _result(sample, order="bicubic", *, fill_holes=False):
     """Return the fine perspective depth, (H, W)."""
     fine = Interpolation(order, fill_holes=fill_holes)(sample)
@@ -72,7 +67,8 @@ def test_bilinear_weights_the_four_neighbours_by_distance():
 
 @pytest.mark.parametrize("kernel", ["box", "nearest"])
 def test_low_and_high_resolution_pixels_are_matched_through_their_cameras(kernel):
-    perspective = _ramp()
+    v, u = np.mgrid[:32, :48]
+    perspective = torch.from_numpy(2 + 0.03 * u - 0.02 * v)
     fine = _result(_sample(perspective, kernel), "bilinear")
     inside = (slice(2, -2), slice(2, -2))  # between the outermost low-resolution pixel centres
     np.testing.assert_allclose(fine[inside], perspective.numpy()[inside], rtol=1e-12)

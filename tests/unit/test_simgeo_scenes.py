@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from dsr.geometry.camera import Camera
-from dsr.synthetic.raycast import Body, Box, Cylinder, Implicit, Plane, Sphere, World, area_light, cast, render
-from dsr.synthetic.simgeo import SCENES, WALL_Z, build_scene, render_scene
+from dsr.synthetic.raycast import Body, Box, Cylinder, Implicit, Plane, Sphere, World, area_light, render
+from dsr.synthetic.simgeo import SCENES, build_scene, render_scene
 
 SIZE = 64
 
@@ -26,26 +26,6 @@ def object_points(name, number):
     hits = np.stack([body.surface.intersect(origin, rays.reshape(3, -1)) for body in build_scene(name).bodies])
     mine = (hits.argmin(0) == number).reshape(SIZE, SIZE)
     return (picture.depth * rays)[:, mine]
-
-
-def depth_to_normals(picture):
-    """Return forward-difference normals and where the 2 x 2 neighbourhood is on one plane."""
-    points = picture.camera.rays().numpy() * picture.depth
-    down, right = np.diff(points, axis=1)[:, :, :-1], np.diff(points, axis=2)[:, :-1]
-    normal = np.cross(down, right, axis=0)
-    normal /= np.linalg.norm(normal, axis=0)
-    corner = points[:, 1:, 1:] - points[:, :-1, :-1]
-    return normal, np.abs((normal * corner).sum(0)) < 1e-9
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SCENES)
-def test_images_have_the_documented_ranges(name):
-    picture = rendering(name)
-    assert picture.depth.min() > 2.3
-    assert picture.depth.max() == WALL_Z <= 4.0
-    assert picture.rgb.max() > 150
-    assert picture.rgb.min() < 110
 
 
 @pytest.mark.slow
@@ -67,7 +47,12 @@ def test_variants_of_a_scene_share_their_depth_but_not_their_photo():
 
 
 def test_cube_and_wall_have_exactly_four_normals_three_of_them_orthogonal():
-    normal, flat = depth_to_normals(rendering("cube_no_texture"))
+    picture = rendering("cube_no_texture")
+    points = picture.camera.rays().numpy() * picture.depth
+    down, right = np.diff(points, axis=1)[:, :, :-1], np.diff(points, axis=2)[:, :-1]
+    normal = np.cross(down, right, axis=0)
+    normal /= np.linalg.norm(normal, axis=0)
+    flat = np.abs((normal * (points[:, 1:, 1:] - points[:, :-1, :-1])).sum(0)) < 1e-9  # 2 x 2 pixels on one plane
     found, count = np.unique(np.round(normal[:, flat].T, 6) + 0.0, axis=0, return_counts=True)
     assert len(found) == 4
     assert count.min() > 50
@@ -110,11 +95,6 @@ def test_paint_follows_the_name_within_the_albedo_of_real_materials():
         first = build_scene(name).bodies[0]
         change[name] = np.abs(first.albedo(points + 0.01) - first.albedo(points)).mean()
     assert change["sphere_cylinder_high_freq"] > 5 * change["sphere_cylinder_low_freq"]
-
-
-def test_unknown_scene_is_refused_with_the_choices():
-    with pytest.raises(ValueError, match=r"sphere_cylinder_low_freq.*got 'teapot'"):
-        render_scene("teapot")
 
 
 BACK = Plane(np.array([0.0, 0.0, 4.0]), np.array([0.0, 0.0, -1.0]))
@@ -194,13 +174,6 @@ def test_implicit_sphere_agrees_with_the_exact_one():
     np.testing.assert_allclose(found[hit], expected[hit], atol=1e-9)
     points = expected[hit] * rays[:, hit]
     np.testing.assert_allclose(implicit.normal(points), exact.normal(points), atol=1e-3)
-
-
-def test_nearest_body_is_seen():
-    near, far = (Sphere(np.array([0.0, 0.0, z]), np.eye(3), 0.3) for z in (2.0, 3.0))
-    depth, index = cast(scene_of(far, near), AHEAD)
-    assert depth[0] == pytest.approx(1.7)
-    assert index[0] == 1
 
 
 def test_plain_wall_is_brightest_as_by_the_cosine_law():

@@ -57,27 +57,18 @@ pytestmark = [
 ]
 
 
-def _four(value):
-    return torch.full((1, 1, 1, 1), value, dtype=torch.float64)
-
-
-def _batch(depth, camera, coarse):
-    """Return a batch of one map whose low-resolution disparities span ``coarse``."""
-    return {
-        "depth": depth[None],
-        "rays": camera.rays()[None],
-        "bf": _four((camera.baseline or 0.2) * camera.fx),
-        "doffs": _four(camera.doffs),
-        "disparity_lr": torch.tensor(coarse, dtype=torch.float64).view(1, 1, 1, 2),
-    }
-
-
 STEREO = Camera(width=13, height=12, fx=20.0, fy=25.0, cx=4.0, cy=7.0, baseline=0.5, doffs=1.0)
 
 
 def _wall():
     """Return a wall at 2 m whose disparity is 0.5 * 20 / 2 - 1 = 4 pixels, of low-resolution ones from 3 to 5."""
-    return _batch(torch.full((1, 12, 13), 2.0, dtype=torch.float64), STEREO, (3.0, 5.0))
+    return {
+        "depth": torch.full((1, 1, 12, 13), 2.0, dtype=torch.float64),
+        "rays": STEREO.rays()[None],
+        "bf": torch.full((1, 1, 1, 1), 10.0, dtype=torch.float64),
+        "doffs": torch.ones((1, 1, 1, 1), dtype=torch.float64),
+        "disparity_lr": torch.tensor([[[[3.0, 5.0]]]], dtype=torch.float64),
+    }
 
 
 def _ramp(slope, height=4.0):
