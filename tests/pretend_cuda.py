@@ -62,13 +62,6 @@ class CudaTensor(Tensor):
     def is_cuda(self):
         return True
 
-    @property
-    def is_meta(self):
-        return False
-
-    def __repr__(self):
-        return f"{self.values!r} on {CUDA}"
-
     @classmethod
     def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
         """Check the devices, and compute on the CPU."""

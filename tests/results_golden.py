@@ -394,14 +394,9 @@ def _given(ratio):
 
 
 def _waves(extent, strength=0.004, *, floor=1.0, holes=0.0):
-    """Return depth of a floor, a wall and a box, (1, 144, 192), with noise that is alike over some pixels.
+    """Return depth of a floor, a wall and a box, (1, 144, 192), with noise that is alike over ``extent`` pixels.
 
-    Args:
-        extent: these pixels.
-        strength: relative standard deviation of the noise.
-        floor: least part of it, in the left of the map; all in the right.
-        holes: share of the pixels that are missing.
-
+    ``strength`` is its relative standard deviation, ``floor`` its least part, in the left of the map.
     """
     v, u = np.mgrid[:144, :192].astype(np.float64)
     inverse = np.where(v > 96, 0.4 + 0.003 * (v - 96), 0.4 + 0.0003 * u)

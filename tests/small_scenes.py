@@ -81,12 +81,13 @@ def sphere_depth(rays: Tensor, centre: ArrayLike, radius: float) -> Tensor:
     return torch.where(root > 0, (half - root.clamp(min=0).sqrt()) / square, torch.inf)
 
 
-def problem(scale: int, height: int, width: int) -> DepthSample:
+def problem(scale: float, height: int, width: int, doffs: float = 0.0) -> DepthSample:
     """Return the problem of a random low-resolution map of this size and a random photo, without the truth."""
-    camera = Camera(scale * width, scale * height, 600.0, 600.0, 3.0, 4.0, baseline=0.2)
+    fine = round(scale * height), round(scale * width)
+    camera = Camera(fine[1], fine[0], 600.0, 600.0, 3.0, 4.0, baseline=0.2, doffs=doffs)
     low = camera.rescale(width, height)
-    depth = from_range(maps(height, width)[0] / scale, low, "disparity")
-    return DepthSample("test", "scene", photos(scale * height, scale * width)[0], depth, camera, low, scale)
+    depth = from_range(maps(height, width)[0] * (width / fine[1]), low, "disparity")
+    return DepthSample("test", "scene", photos(*fine)[0], depth, camera, low, scale)
 
 
 def plane_map(height: int, width: int, along_u: float = 0.3, along_v: float = -0.2) -> Tensor:

@@ -59,13 +59,8 @@ def test_scores_on_lucy_are_those_that_the_recipe_expects(load_scene, name):
     model, _, scale = name.rpartition("_x")
     method = read_recipe(model).build(int(scale))
     sample = make_sample(load_scene("lucy"), int(scale), Downsampling("box"), method.range_type)
-    scores = _worst(method(sample), sample, catalogue())
+    with torch.inference_mode():
+        rows = score_image(method(sample), sample.depth, sample.camera.rays(), catalogue())
+    scores = {row.metric: row.value for row in rows if row.variant in ("", WORST)}
     measured = [1000 * scores["RMSE_v"], 1000 * scores["DSSIM_v"], 1000 * scores["RMSE_d"]]
     assert measured == pytest.approx([float(each) for each in found.groups()], abs=0.6)
-
-
-@torch.inference_mode()
-def _worst(depth, sample, metrics):
-    """Return the scores, under the worst of the four lights."""
-    rows = score_image(depth, sample.depth, sample.camera.rays(), metrics)
-    return {row.metric: row.value for row in rows if row.variant in ("", WORST)}

@@ -60,9 +60,7 @@ def _sample(size=48):
 
 
 def _on(sample, device):
-    assert sample.depth is not None
-    maps = {name: getattr(sample, name).to(device) for name in ("rgb", "depth_lr", "depth")}
-    return replace(sample, **maps)
+    return replace(sample, **{name: getattr(sample, name).to(device) for name in ("rgb", "depth_lr", "depth")})
 
 
 @pytest.mark.parametrize("name", METHODS)

@@ -34,9 +34,9 @@ def test_differences_are_those_of_a_map_that_goes_on_linearly():
     assert stencil(step).bend[0, 0, 4].tolist() == [0, 0, 0, 0, 2, 2, 2, 2, 0, 0, 0, 0]
 
 
-def _net(scale=4, width=8, deep=12):
+def _net(scale=4):
     """Return a small network with random weights, also in the layers that begin small."""
-    return with_any_weights(lambda: FacetsUNet(scale, width, deep, 4).eval(), 0.05, 3).requires_grad_()
+    return with_any_weights(lambda: FacetsUNet(scale, 8, 12, 4).eval(), 0.05, 3).requires_grad_()
 
 
 def _maps(answer):

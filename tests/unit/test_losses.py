@@ -206,10 +206,10 @@ def _surface(seed, size=SIZE):
     return 2 + 0.02 * waves[None, None]
 
 
-def _sample(size=SIZE, scale=2):
+def _sample(size):
     camera = Camera(size, size, 1.2 * size, 1.2 * size, (size - 1) / 2, (size - 1) / 2)
     scene = Scene("set", "waves", torch.full((3, size, size), 0.5), camera, _surface(3, size)[0])
-    return make_sample(scene, scale, Downsampling("box"), "disparity")
+    return make_sample(scene, 2, Downsampling("box"), "disparity")
 
 
 def test_a_visual_loss_is_the_metric_averaged_over_the_lights(network):
@@ -300,10 +300,10 @@ BENT = Camera(width=18, height=16, fx=20.0, fy=22.0, cx=8.0, cy=7.0)
 LIGHT = torch.tensor([0.5, -0.1, -0.2, 0.1, 0.03, 0.02, 0.01, -0.03, 0.02], dtype=torch.float64)
 
 
-def _bumps(amplitude=0.1, phase=0.0):
+def _bumps(phase=0.0):
     """Return a bumpy surface, (1, 1, 16, 18)."""
     v, u = grid(16, 18)
-    return (2 + amplitude * torch.sin(0.4 * u + phase) * torch.cos(0.3 * v))[None, None]
+    return (2 + 0.1 * torch.sin(0.4 * u + phase) * torch.cos(0.3 * v))[None, None]
 
 
 def _normals(depth):

@@ -27,18 +27,15 @@ def _wall(depth, size=400):
     return torch.full((1, size, size), depth, dtype=torch.float64)
 
 
-def _scene(depth=STEPS, measured=None):
-    return Scene("set", "hall", torch.zeros(3, 4, 8), CAMERA, depth, measured or {})
-
-
 # What all kinds have in common
 
 
 @pytest.mark.parametrize("method", RANGE_TYPES)
 @pytest.mark.parametrize("noise", SENSORS)
 def test_sensor_noise_applies_to_metric_depth_whatever_is_averaged(noise, method):
-    clean = make_sample(_scene(), 2, BOX, method).depth_lr
-    noisy = make_sample(_scene(), 2, BOX, method, noise, seeded(5)).depth_lr
+    scene = Scene("set", "hall", torch.zeros(3, 4, 8), CAMERA, STEPS)
+    clean = make_sample(scene, 2, BOX, method).depth_lr
+    noisy = make_sample(scene, 2, BOX, method, noise, seeded(5)).depth_lr
     torch.testing.assert_close(noisy, noise(clean, seeded(5)), rtol=1e-12, atol=0, equal_nan=True)
 
 

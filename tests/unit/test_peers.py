@@ -1,6 +1,8 @@
 """The published networks of the field: how they are fed and read, and each part against an independent computation."""
 
+import math
 import pickle
+from dataclasses import replace
 from typing import ClassVar
 
 import cv2
@@ -11,11 +13,11 @@ import scipy.ndimage
 import torch
 from bombs import Trap
 from PIL import Image
-from small_scenes import normal
+from small_scenes import normal, problem
 from torch import nn
 from torch.nn import functional
 
-from dsr.geometry.camera import Camera, from_range
+from dsr.geometry.camera import from_range
 from dsr.methods.base import Cost
 from dsr.methods.images import dct2, idct2, inpaint, resize_bicubic
 from dsr.methods.networks.peers import PeerNetwork, dctnet, dornet, fold_batch_norm, load_peer, local_filters, pgsr
@@ -26,7 +28,6 @@ from dsr.methods.networks.peers.peer import Peer
 from dsr.methods.networks.peers.pgsr import PGSR
 from dsr.methods.networks.weight_files import has_weights, nearest_scale
 from dsr.methods.recipe import read_recipe
-from dsr.sample import DepthSample
 from dsr.utils.configuration import ConfigError
 from dsr.utils.versions import file_hash
 
@@ -70,17 +71,10 @@ class Smoothed(Enlarged):
 
 def _sample(size_lr=(6, 9), scale=4, doffs=0.0):
     """Return a sample whose true disparity goes beyond the low-resolution one."""
-    generator = torch.Generator().manual_seed(3)
-    height, width = (round(scale * n) for n in size_lr)
-    camera = Camera(width, height, 600.0, 600.0, 3.0, 4.0, baseline=0.2, doffs=doffs)
-    camera_lr = camera.rescale(size_lr[1], size_lr[0])
-    disparity_lr = 20 + 5 * torch.rand((1, *size_lr), generator=generator, dtype=torch.float64)
-    disparity = torch.linspace(10, 40, height * width, dtype=torch.float64).view(1, height, width)
-    depth_lr = from_range(disparity_lr / (width / size_lr[1]), camera_lr, "disparity")
-    rgb = torch.rand((3, height, width), generator=generator)
-    return DepthSample(
-        "test", "scene", rgb, depth_lr, camera, camera_lr, scale, from_range(disparity, camera, "disparity")
-    )
+    sample = problem(scale, *size_lr, doffs)
+    shape = (1, *sample.rgb.shape[1:])
+    disparity = torch.linspace(10, 40, math.prod(shape), dtype=torch.float64).view(shape)
+    return replace(sample, depth=from_range(disparity, sample.camera, "disparity"))
 
 
 def _pillow(values, size):
@@ -128,7 +122,7 @@ def test_true_range_is_flagged_and_needs_the_truth():
     expected = (sample.disparity_lr() - 10) / 30
     torch.testing.assert_close(upsampler.net.seen[0][0, :, :6, :9].double(), expected, rtol=0, atol=1e-6)
     torch.testing.assert_close(depth, sample.depth_lr, rtol=1e-5, atol=0)
-    unknown = DepthSample("test", "scene", sample.rgb, sample.depth_lr, sample.camera, sample.camera_lr, 1)
+    unknown = replace(sample, depth=None)
     measured = Peer(Enlarged())
     assert torch.equal(measured(sample), measured(unknown))  # does not read the truth
     with pytest.raises(ValueError, match="scene: range=truth expects"):
@@ -139,7 +133,7 @@ def test_holes_are_inpainted_before_the_range_is_taken():
     sample = _sample(scale=1)
     holes = sample.depth_lr.clone()
     holes[0, 2:4, 3:6] = torch.nan
-    pierced = DepthSample("test", "scene", sample.rgb, holes, sample.camera, sample.camera_lr, 1)
+    pierced = replace(sample, depth_lr=holes, depth=None)
     depth = Peer(Enlarged())(pierced)
     expected = from_range(inpaint(pierced.disparity_lr()[None])[0], sample.camera, "disparity")
     torch.testing.assert_close(depth, expected, rtol=1e-5, atol=0)
@@ -372,13 +366,8 @@ def test_transfer_edges_solves_the_linear_system():
         np.testing.assert_allclose(solved[:, channel].reshape(2, -1).numpy(), expected, atol=1e-12)
 
 
-def make_inputs(batch=2, channels=3, outputs=4, height=5, width=6):
-    return (
-        normal(batch, channels, height, width),
-        2 * normal(batch, 18, height, width, seed=1),
-        normal(batch, 9, height, width, seed=2).sigmoid(),
-        normal(batch, outputs, channels, 3, 3, seed=3),
-    )
+OFFSETS, MASK = 2 * normal(2, 18, 5, 6, seed=1), normal(2, 9, 5, 6, seed=2).sigmoid()
+DEFORMED = normal(2, 3, 5, 6), OFFSETS, MASK, normal(2, 4, 3, 3, 3, seed=3)
 
 
 def convolve_in_loops(x, offsets, mask, weight):
@@ -393,9 +382,8 @@ def convolve_in_loops(x, offsets, mask, weight):
 
 
 def test_deformable_conv3x3_equals_plain_loops():
-    inputs = make_inputs()
-    expected = convolve_in_loops(*(each.numpy() for each in inputs))
-    np.testing.assert_allclose(deformable_conv3x3(*inputs).numpy(), expected, atol=1e-12)
+    expected = convolve_in_loops(*(each.numpy() for each in DEFORMED))
+    np.testing.assert_allclose(deformable_conv3x3(*DEFORMED).numpy(), expected, atol=1e-12)
 
 
 def test_chunks_and_strips_change_rounding_errors_only(monkeypatch):
@@ -405,7 +393,7 @@ def test_chunks_and_strips_change_rounding_errors_only(monkeypatch):
     cases = (
         (pgsr, "_STRIP", 3 * 16 * 4, lambda: net(rgb, values)),
         (dctnet, "_CHUNK", 2 * 4 * 6, lambda: transfer_edges(*edges, strength)),
-        (dornet, "_CHUNK", 1, lambda: deformable_conv3x3(*make_inputs())),
+        (dornet, "_CHUNK", 1, lambda: deformable_conv3x3(*DEFORMED)),
     )
     for module, name, size, run in cases:
         whole = run()

@@ -109,12 +109,8 @@ def test_convolutions_may_run_in_bfloat16():
     assert float((halved - exact).abs().max()) < 0.05 * 9
 
 
-def _guided(scale=4, *, stages=2, filters=5, size=5, noise=0.2):
-    return with_any_weights(lambda: DynamicGuidance(scale, stages, filters, size), noise, scale)
-
-
-def _stage(*, filters=5, size=5):
-    return _guided(stages=1, filters=filters, size=size).double().stages[0]
+def _guided(scale=4, *, stages=2, filters=5, size=5):
+    return with_any_weights(lambda: DynamicGuidance(scale, stages, filters, size), 0.2, scale)
 
 
 @pytest.mark.parametrize("size", [3, 4, 7])
@@ -128,7 +124,7 @@ def test_filters_are_orthonormal_and_blind_to_what_the_first_ones_see(size):
 
 
 def test_stage_equals_plain_loops():
-    stage, rgb = _stage(filters=3), photos(16, 16).double()
+    stage, rgb = _guided(stages=1, filters=3).double().stages[0], photos(16, 16).double()
     coarse = maps(4, 4) / 30
     x = repeat_blocks(coarse, 4) + 0.1 * maps(16, 16)
     with torch.no_grad():
@@ -169,7 +165,7 @@ def test_mixed_precision_training_computes_in_float32():
 
 
 def test_map_may_break_at_a_photo_edge_and_a_flat_photo_has_no_influence():
-    stage = _stage()
+    stage = _guided(stages=1).double().stages[0]
     edge = torch.zeros(1, 3, 16, 16, dtype=torch.float64)
     edge[..., 8:] = 1.0
     weights = stage.weights(edge)[0]
@@ -184,9 +180,9 @@ RESNET18 = 11_689_512 - 513_000 + 64 * 49
 """Parameters of ResNet-18 (He et al. 2016) without its classifier, with a fourth input channel."""
 
 
-def _sparse(scale=4, width=4):
+def _sparse(scale=4):
     torch.manual_seed(scale)
-    return SparseToDense(scale, width).eval()
+    return SparseToDense(scale, 4).eval()
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8, 16])

@@ -50,10 +50,9 @@ def test_isolated_plateau_is_unchanged():
 CAMERA = Camera(90, 60, 80.0, 82.0, 44.0, 30.5, baseline=0.1, doffs=3.0)
 
 
-def plane_depth(camera, a=0.05, b=-0.3, c=0.4):
-    """Return the exact depth of the plane 1 / z = (a, b, c) . r."""
-    rays = camera.rays()
-    return 1 / (a * rays[0] + b * rays[1] + c * rays[2])[None]
+def plane_depth(camera):
+    x, y, _ = camera.rays()
+    return 1 / (0.05 * x - 0.3 * y + 0.4)[None]
 
 
 def scene(depth, camera=CAMERA):
