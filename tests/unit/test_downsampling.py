@@ -246,9 +246,6 @@ def test_measured_map_of_an_indivisible_size_is_that_of_the_cropped_photo():
     assert sample.notes == ("cropped from 21 x 23 to 20 x 20, which 4 divides",)
 
 
-# Noise
-
-
 def _wall(name="hall", dataset="set"):
     depth = torch.full((1, 320, 480), 2.0, dtype=torch.float64)
     return Scene(dataset, name, torch.rand(3, 320, 480), Camera(480, 320, 60.0, 55.0, 240.0, 160.0), depth)

@@ -81,16 +81,11 @@ def _slow_lap1(x, y, levels):
 
 @pytest.mark.parametrize("levels", [1, 2, 3])
 @pytest.mark.parametrize("size", [(12, 12), (13, 18), (16, 15)])
-def test_lap1_equals_a_plain_pyramid(size, levels):
-    x, y = _map(0, *size), _map(1, *size)
+@pytest.mark.parametrize("holes", [0.0, 0.2])
+def test_lap1_equals_a_plain_pyramid_that_weights_pixels_by_their_valid_fraction(size, levels, holes):
+    x, y = _with_holes(_map(0, *size), 2, holes), _with_holes(_map(1, *size), 3, holes)
     expected = _slow_lap1(x[0, 0].numpy(), y[0, 0].numpy(), levels)
     assert lap1(x, y, levels=levels).item() == pytest.approx(expected, rel=1e-12)
-
-
-def test_lap1_with_holes_weights_pixels_by_their_valid_fraction():
-    x, y = _with_holes(_map(0), 2), _with_holes(_map(1), 3)
-    expected = _slow_lap1(x[0, 0].numpy(), y[0, 0].numpy(), 3)
-    assert lap1(x, y).item() == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("holes", [0.0, 0.3])
@@ -133,8 +128,6 @@ def test_gradient_of_a_loss_is_that_of_its_value(name, holes):
     x, y = _map(0, *size), _with_holes(_map(1, *size), 3, holes)
     assert torch.autograd.gradcheck(lambda x: LOSSES[name](x, y), x.requires_grad_())
 
-
-# The objective, with a camera per sample
 
 CAMERAS = (
     Camera(width=14, height=12, fx=15.0, fy=14.0, cx=6.1, cy=5.8, baseline=0.12, doffs=0.7),
@@ -180,8 +173,6 @@ def test_objective_has_finite_gradients_at_the_truth_and_beyond_infinity():
         DepthObjective("lap1", 0.7)(Answer(guess), batch)["loss"].backward()
         assert bool(guess.grad.isfinite().all())
 
-
-# Losses of renderings
 
 SIZE = 32
 WINDOW = Camera(SIZE, SIZE, 40.0, 40.0, 15.5, 15.5)

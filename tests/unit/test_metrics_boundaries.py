@@ -292,6 +292,3 @@ def test_hole_does_not_win():
     assert holed["Points_flying"] == 0
     assert holed["Points_covered"] == pytest.approx(41 / 48)
     assert holed["Points_F_1cm"] < found["Points_F_1cm"]
-    nothing = _points(np.full_like(U, np.nan), STEP)
-    assert nothing.pop("Points_covered") == 0
-    assert all(math.isnan(value) for value in nothing.values())

@@ -156,8 +156,6 @@ def test_masked_median_is_numpys(count):
     assert found.item() == pytest.approx(expected, nan_ok=True)
 
 
-# The classes
-
 CAMERA = Camera(width=40, height=36, fx=40.0, fy=40.0, cx=20.0, cy=18.0)
 
 

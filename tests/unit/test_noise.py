@@ -27,9 +27,6 @@ def _wall(depth, size=400):
     return torch.full((1, size, size), depth, dtype=torch.float64)
 
 
-# What all kinds have in common
-
-
 @pytest.mark.parametrize("method", RANGE_TYPES)
 @pytest.mark.parametrize("noise", SENSORS)
 def test_sensor_noise_applies_to_metric_depth_whatever_is_averaged(noise, method):
@@ -37,9 +34,6 @@ def test_sensor_noise_applies_to_metric_depth_whatever_is_averaged(noise, method
     clean = make_sample(scene, 2, BOX, method).depth_lr
     noisy = make_sample(scene, 2, BOX, method, noise, seeded(5)).depth_lr
     torch.testing.assert_close(noisy, noise(clean, seeded(5)), rtol=1e-12, atol=0, equal_nan=True)
-
-
-# Time of flight
 
 
 def test_disparity_noise_of_time_of_flight_is_normal_with_the_given_deviation():
@@ -57,9 +51,6 @@ def test_non_positive_disparity_of_time_of_flight_is_a_hole():
     assert torch.equal(noisy.isnan(), v + 651 / v * draws <= 0)
     assert bool((noisy[noisy.isfinite()] > 0).all())
     assert bool(TimeOfFlight(doffs=200.0)(_wall(3.0, 10), seeded()).isnan().all())
-
-
-# Structured light
 
 
 @pytest.mark.parametrize("depth", [1.0, 2.0, 3.0, 5.0])
@@ -136,9 +127,6 @@ def test_readings_out_of_range_are_holes_unless_the_limits_are_off():
     torch.testing.assert_close(open_ended[..., :7], depth[..., :7], rtol=0.03, atol=0)
     assert bool(open_ended[..., 7:].isnan().all())  # no disparity, and behind the sensor
     assert bool(TimeOfFlight()(depth, seeded())[0, 0, 8].isnan())
-
-
-# Cameras drawn at random
 
 
 def _photo(like):

@@ -125,9 +125,6 @@ def test_disparity_at_or_beyond_infinity_has_no_depth():
     assert to_depth(disparity, _wall())[0, 0, 0, 2] == pytest.approx(20)
 
 
-# The balanced weight
-
-
 def _plane(baseline=None, doffs=0.0, slope=0.02, fx=80.0):
     """Return the tensors of the plane with d + doffs = slope u + 3, 100 columns wide."""
     camera = Camera(width=100, height=4, fx=fx, fy=70.0, cx=40.0, cy=2.0, baseline=baseline, doffs=doffs)
@@ -152,9 +149,6 @@ def test_balanced_weight_is_the_median_over_the_patches():
     assert balance_weight(patches) == balance_weight(patches[2:])
 
 
-# The schedule
-
-
 def _rates(steps, warmup, count):
     """Return the learning rates of a schedule as fractions of the highest."""
     optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
@@ -172,9 +166,6 @@ def test_learning_rate_warms_up_linearly_and_falls_as_a_cosine_to_zero():
     assert rates[12] == pytest.approx(0.5)  # halfway down
     assert rates[8] == pytest.approx((1 + math.sqrt(0.5)) / 2)
     assert rates[20] == rates[25] == pytest.approx(0, abs=1e-15)
-
-
-# The module
 
 
 def _scene(seed, holes=0.0):

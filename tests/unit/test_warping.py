@@ -101,9 +101,6 @@ def test_registered_camera_has_the_photos_view_at_the_sensors_resolution():
     assert registered_camera(Camera(4000, 3000, 4000.0, 4000.0, 2000.0, 1500.0), photo) == photo
 
 
-# poses
-
-
 def test_relative_pose_maps_between_the_two_cameras():
     first, second = transform(), transform((20.0, 10.0, 0.0), (1.0, 2.0, 3.0))
     point = np.array([0.1, 0.2, 1.5, 1.0])
