@@ -75,16 +75,20 @@ def _loop(f, w, steps, data, huber, window):
     return (u - f)[r : r + height, 2 * r : 2 * r + width]
 
 
-def test_gradients_of_maps_weights_and_parameters_agree_with_finite_differences():
-    window = 3
-    first, weights = _problem(4, window)
-    stage = UnrolledHuber(window, 2, 3.0, 0.5).double()
-    names, parameters = zip(*stage.named_parameters(), strict=True)
+def _gradients_are_those_of_differences(net, *maps, **tolerance):
+    """Check the gradients of a network's answer to maps in these, where they require some, and in its parameters."""
+    names, parameters = zip(*net.named_parameters(), strict=True)
 
-    def answer(first, weights, *values):
-        return torch.func.functional_call(stage, dict(zip(names, values, strict=True)), (first, weights))
+    def answer(*given):
+        values = dict(zip(names, given[len(maps) :], strict=True))
+        return torch.func.functional_call(net, values, given[: len(maps)])
 
-    assert torch.autograd.gradcheck(answer, [first.requires_grad_(), weights.requires_grad_(), *parameters])
+    return torch.autograd.gradcheck(answer, [*maps, *parameters], **tolerance)
+
+
+def test_gradients_of_a_stage_agree_with_finite_differences():
+    given = [each.requires_grad_() for each in _problem(4, 3)]
+    assert _gradients_are_those_of_differences(UnrolledHuber(3, 2, 3.0, 0.5).double(), *given)
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8, 16])
@@ -148,13 +152,8 @@ def test_stage_equals_plain_loops():
 
 def test_gradients_agree_with_finite_differences():
     net = _guided(2, filters=2, size=3).double().requires_grad_()
-    rgb, coarse = photos(8, 6).double(), maps(4, 3) / 30
-    names, parameters = zip(*net.named_parameters(), strict=True)
-
-    def answer(*values):
-        return torch.func.functional_call(net, dict(zip(names, values, strict=True)), (rgb, coarse))
-
-    assert torch.autograd.gradcheck(answer, parameters, eps=1e-7, atol=1e-4, fast_mode=True)
+    given = photos(8, 6).double(), maps(4, 3) / 30
+    assert _gradients_are_those_of_differences(net, *given, eps=1e-7, atol=1e-4, fast_mode=True)
 
 
 def test_mixed_precision_training_computes_in_float32():

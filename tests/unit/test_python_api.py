@@ -273,35 +273,27 @@ def test_upsampler_and_surface_go_to_other_processes(surface):
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(surface)).depth, surface.depth)
 
 
-def frames(poses):
-    return [(photo(), metres(number), CAMERA, pose) for number, pose in enumerate(poses)]
+def watched(frames, taken):
+    """Yield frames, and their numbers into a list as they are asked for."""
+    for number, frame in enumerate(frames):
+        taken.append(number)
+        yield frame
 
 
 def test_stream_without_poses_gives_each_frame_as_it_comes():
-    taken = []
-
-    def camera():
-        for number, frame in enumerate(frames([None] * 4)):
-            taken.append(number)
-            yield frame[: 3 + number % 2]
-
-    upsampler = dsr.Upsampler(QUICK)
-    for number, surface in enumerate(upsampler.stream(camera())):
+    taken, upsampler = [], dsr.Upsampler(QUICK)
+    frames = [(photo(), metres(number), CAMERA, None)[: 3 + number % 2] for number in range(4)]
+    for number, surface in enumerate(upsampler.stream(watched(frames, taken))):
         assert taken[-1] == number
         np.testing.assert_array_equal(surface.depth, upsampler(photo(), metres(number), CAMERA).depth)
     assert taken == [0, 1, 2, 3]
 
 
 def test_stream_reads_no_further_than_frames_that_vote_and_names_a_wrong_one():
-    poses, taken = walk(8), []
-
-    def camera():
-        for number, frame in enumerate(frames(poses)):
-            taken.append(number)
-            yield frame if number < 6 else (photo(), millimetres(), CAMERA)
-
+    frames, taken = [(photo(), metres(number), CAMERA, pose) for number, pose in enumerate(walk(6))], []
+    frames += [(photo(), millimetres(), CAMERA)] * 2
     upsampler, ahead = dsr.Upsampler(QUICK), []
-    surfaces = upsampler.stream(camera(), neighbours=2)
+    surfaces = upsampler.stream(watched(frames, taken), neighbours=2)
     for _ in range(5):
         next(surfaces)
         ahead.append(taken[-1])
