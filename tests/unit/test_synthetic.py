@@ -119,10 +119,6 @@ AHEAD = np.array([[0.0], [0.0], [1.0]])
 EYE = np.zeros((3, 1))
 
 
-def white(points):
-    return np.ones_like(points)
-
-
 def grey(points):
     return np.full_like(points, 0.2)
 
@@ -140,7 +136,7 @@ def test_planes_have_affine_inverse_depth():
     _, depth = render(scene_of(), small_camera())
     np.testing.assert_array_equal(depth, 4.0)
     facing = np.array([0.6, 0.0, -0.8])
-    slanted = Body(Plane(np.array([0.0, 0.0, 2.0]), facing), white)
+    slanted = Body(Plane(np.array([0.0, 0.0, 2.0]), facing), np.ones_like)
     _, depth = render(World((slanted,), np.zeros((3, 9)), 0.0), small_camera())
     x = (np.arange(33) - 16) / (1.2 * 33)
     np.testing.assert_allclose(1 / depth, np.broadcast_to((0.8 - 0.6 * x) / 1.6, (33, 33)), rtol=1e-14)
@@ -217,7 +213,7 @@ def test_edges_of_the_photo_are_antialiased():
     camera = small_camera(65)
     lights = np.tile([[0.0], [0.0], [-1.0]], 9)
     black = Body(Sphere(np.array([0.0, 0.0, 3.0]), np.eye(3), 0.5), np.zeros_like)
-    rgb, _ = render(World((black, Body(BACK, white)), lights, 0.0), camera)
+    rgb, _ = render(World((black, Body(BACK, np.ones_like)), lights, 0.0), camera)
     assert len(np.unique(rgb[20, :, 0])) > 3
     assert rgb[32, 32, 0] == 0
 
