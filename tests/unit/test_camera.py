@@ -125,7 +125,7 @@ LENSES = {
     "rational": Lens("brown_conrady", (0.4, -0.1, 0.001, 0.002, 0.03, 0.7, -0.05, 0.02)),
     "modified": Lens("modified_brown_conrady", BROWN.coefficients),
     "fisheye": FISHEYE,
-    "thin prism": Lens("thin_prism_fisheye", (-0.06, 0.02, 0.002, -0.001, -0.01, 0.002, 0.003, -0.002)),
+    "thin prism": Lens("thin_prism_fisheye", (-0.06, 0.02, 0.002, -0.01, -0.01, 0.002, 0.003, -0.002)),
 }
 
 
