@@ -60,9 +60,7 @@ def _sample(size=48):
 
 
 def _on(sample, device):
-    assert sample.depth is not None
-    maps = {name: getattr(sample, name).to(device) for name in ("rgb", "depth_lr", "depth")}
-    return replace(sample, **maps)
+    return replace(sample, **{name: getattr(sample, name).to(device) for name in ("rgb", "depth_lr", "depth")})
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -184,6 +182,12 @@ def test_auto_is_the_device_of_the_environment(monkeypatch, gpu):
     monkeypatch.setenv("DSR_DEVICE", "abacus")
     with pytest.raises(ConfigError, match=r"^\$DSR_DEVICE: expected auto, .*, got 'abacus'"):
         pick_device("auto")
+
+
+@pytest.mark.parametrize("name", ["gpu", "cuda:99", "meta", "", "cpu:x"])
+def test_device_that_this_machine_lacks_is_refused(name):
+    with pytest.raises(ConfigError, match=r"^device: expected auto, cpu or a device of this machine, got "):
+        pick_device(name)
 
 
 @pytest.mark.parametrize(
