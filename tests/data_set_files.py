@@ -199,7 +199,7 @@ SETS = {
     "sunrgbd": Set(SunRGBD, "kv2_x", {
         "kv2/x/image/1.jpg": JPG, "kv2/x/intrinsics.txt": b"350 0 255 0 355 190 0 0 1\n",
         "kv2/x/depth/1.png": png(turned(ramp(384, 512, 8180))),
-    }, 8.220, (350, 355, 255, 190), {}, {"size": None}, {}, 12),
+    }, 8.220, (350, 355, 255, 190), {}, {"size": None}),
     "tartanair": Set(TartanAir, "office_000000", {
         "office/image_left/000000_left.png": png(photo(480, 640)),
         "office/depth_left/000000_left_depth.npy": npy(VGA.astype(np.float32) / 1024),

@@ -9,11 +9,7 @@ be read (``item``, ``bool``, indices by masks), so that methods run to their end
 torch's FakeTensorMode has such a device, too, but without values: what reads one ends there.
 """
 
-from __future__ import annotations
-
 import contextlib
-from collections.abc import Callable, Iterator
-from typing import Any
 from unittest import mock
 
 import lightning
@@ -34,7 +30,7 @@ _INDEXED = ("index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_ind
 _JOINED = ("cat", "stack")
 _MOVES = ("to", "cpu", "cuda")
 _READS = ("tolist", "numpy", "__array__")
-_EMPTY: list[bool] = []  # Not empty while a tensor is made that is meant to be on ``meta``, without values
+_EMPTY = []  # Not empty while a tensor is made that is meant to be on ``meta``, without values
 
 
 class CudaTensor(Tensor):
@@ -43,10 +39,10 @@ class CudaTensor(Tensor):
     values: Tensor
 
     @staticmethod
-    def __new__(cls, values: Tensor, *, requires_grad: bool = False) -> CudaTensor:
+    def __new__(cls, values, *, requires_grad=False):
         """Make one of a tensor of the CPU, which it shares."""
         values = values.resolve_conj().resolve_neg()  # C++ does not see these bits
-        made = Tensor._make_wrapper_subclass(  # type: ignore[attr-defined]
+        made = Tensor._make_wrapper_subclass(
             cls,
             values.shape,
             strides=values.stride(),
@@ -59,22 +55,15 @@ class CudaTensor(Tensor):
         return made
 
     @property
-    def device(self) -> torch.device:  # type: ignore[override]
+    def device(self):
         return CUDA
 
     @property
-    def is_cuda(self) -> bool:  # type: ignore[override]
+    def is_cuda(self):
         return True
 
-    @property
-    def is_meta(self) -> bool:  # type: ignore[override]
-        return False
-
-    def __repr__(self) -> str:
-        return f"{self.values!r} on {CUDA}"
-
     @classmethod
-    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
         """Check the devices, and compute on the CPU."""
         return _compute(func, args, kwargs or {})
 
@@ -83,17 +72,17 @@ class _Factories(TorchDispatchMode):
     """Tensors that C++ makes on the device of a :class:`CudaTensor`."""
 
     @classmethod
-    def _should_skip_dynamo(cls) -> bool:
+    def _should_skip_dynamo(cls):
         return False  # which would import the compiler, seconds
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         return _compute(func, args, kwargs or {})
 
 
 class _Functions(TorchFunctionMode):
     """What Python calls with a device, and what reads a tensor's memory."""
 
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_function__(self, func, types, args=(), kwargs=None):
         kwargs = dict(kwargs or {})
         name = getattr(func, "__name__", "")
         subject = args[0] if args and isinstance(args[0], Tensor) else None
@@ -132,18 +121,18 @@ class _Generator(torch.Generator):
 
     on_cuda: bool
 
-    def __new__(cls, device: Any = "cpu") -> _Generator:
+    def __new__(cls, device="cpu"):
         made = super().__new__(cls, "cpu")
         made.on_cuda = _is_cuda(device)
         return made
 
     @property
-    def device(self) -> torch.device:  # type: ignore[override]
+    def device(self):
         return CUDA if self.on_cuda else _CPU
 
 
 @contextlib.contextmanager
-def pretend_cuda() -> Iterator[torch.device]:
+def pretend_cuda():
     """Have a device ``cuda`` in the block, which is yielded."""
     with contextlib.ExitStack() as stack:
         for name, answer in (("is_available", True), ("is_bf16_supported", True), ("synchronize", None)):
@@ -157,7 +146,7 @@ def pretend_cuda() -> Iterator[torch.device]:
         yield CUDA
 
 
-def _enter_without_gradients(context: Any) -> None:
+def _enter_without_gradients(context):
     """Begin ``torch.inference_mode``, whose tensors take no subclasses' views, as ``torch.no_grad``."""
     context._inference_mode_context = torch.set_grad_enabled(not context.mode and torch.is_grad_enabled())
     context._inference_mode_context.__enter__()
@@ -166,21 +155,21 @@ def _enter_without_gradients(context: Any) -> None:
 class _Accelerator(CPUAccelerator):
     """Lightning's accelerator for the CPU, which has the pretended device."""
 
-    def setup_device(self, device: torch.device) -> None:
+    def setup_device(self, device):
         """Take any device."""
 
 
-def _make_trainer(*, accelerator: str, devices: Any, **named: Any) -> lightning.Trainer:
+def _make_trainer(*, accelerator, devices, **named):
     """Return Lightning's trainer, for the pretended device where it is one for GPUs."""
     if accelerator != "gpu":
         return _Trainer(accelerator=accelerator, devices=devices, **named)
     return _Trainer(strategy=SingleDeviceStrategy(CUDA, _Accelerator()), **named)
 
 
-def _make_autocast(real: Any) -> Callable[..., Any]:
+def _make_autocast(real):
     """Return ``torch.autocast``; for ``cuda`` it is that of the device that C++ sees, which has none."""
 
-    def make(device_type: str, *args: Any, **kwargs: Any) -> Any:
+    def make(device_type, *args, **kwargs):
         if device_type == "cuda":
             return contextlib.nullcontext()
         return real(device_type, *args, **kwargs)
@@ -188,7 +177,7 @@ def _make_autocast(real: Any) -> Callable[..., Any]:
     return make
 
 
-def _compute(func: Any, args: Any, kwargs: Any) -> Any:
+def _compute(func, args, kwargs):
     """Return what an operation of PyTorch gives, on the CPU or on the pretended device."""
     name = func.overloadpacket.__name__
     leaves = [each for each in tree_flatten((args, kwargs))[0] if isinstance(each, Tensor)]
@@ -213,7 +202,7 @@ def _compute(func: Any, args: Any, kwargs: Any) -> Any:
     return return_and_correct_aliasing(func, args, kwargs, wrapped) if on_cuda and name != "_to_copy" else wrapped
 
 
-def _expect_one_device(name: str, args: Any, leaves: list[Tensor]) -> None:
+def _expect_one_device(name, args, leaves):
     """Raise what CUDA raises for tensors of several devices; it takes single numbers of the CPU."""
     if name in _INDEXED and isinstance(args[0], CudaTensor):  # indices may be the CPU's
         leaves = [each for each in args[2:3] if isinstance(each, Tensor)]
@@ -222,13 +211,13 @@ def _expect_one_device(name: str, args: Any, leaves: list[Tensor]) -> None:
             raise RuntimeError(_MIXED.format(name))
 
 
-def _expect_generator(generator: torch.Generator, on_cuda: bool) -> None:
+def _expect_generator(generator, on_cuda):
     if on_cuda != (generator.device.type == "cuda"):
         found, expected = ("cpu", "cuda") if on_cuda else ("cuda", "cpu")
         raise RuntimeError(f"Expected a '{expected}' device type for generator but found '{found}'")
 
 
-def _move(tensor: Tensor, name: str, args: Any, kwargs: dict[str, Any]) -> Tensor:
+def _move(tensor, name, args, kwargs):
     """Carry out ``tensor.to``, ``cpu`` or ``cuda``."""
     rest, device = list(args), kwargs.pop("device", None)
     if name != "to":
@@ -245,35 +234,35 @@ def _move(tensor: Tensor, name: str, args: Any, kwargs: dict[str, Any]) -> Tenso
     converted = Tensor.to(tensor, **kwargs) if kwargs else tensor
     if device is None or _is_cuda(device) == isinstance(tensor, CudaTensor):
         return converted
-    return _Move.apply(converted)  # type: ignore[no-any-return]
+    return _Move.apply(converted)
 
 
 class _Move(torch.autograd.Function):
     """A copy between the devices, which gradients go through, too."""
 
     @staticmethod
-    def forward(ctx: Any, tensor: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx, tensor):
         return tensor.values.clone() if isinstance(tensor, CudaTensor) else CudaTensor(tensor.clone())
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # type: ignore[override]
+    def backward(ctx, gradient):
         return gradient.values.clone() if isinstance(gradient, CudaTensor) else CudaTensor(gradient.clone())
 
 
-def _with_tensors(index: Any) -> Any:
+def _with_tensors(index):
     """Return an index with tensors in place of lists."""
     if isinstance(index, tuple):
         return tuple(_with_tensors(each) for each in index)
     return torch.as_tensor(index) if isinstance(index, list) else index
 
 
-def _values_of(each: Any) -> Any:
+def _values_of(each):
     return each.values if isinstance(each, CudaTensor) else each
 
 
-def _is_cuda(device: Any) -> bool:
+def _is_cuda(device):
     return device is not None and (isinstance(device, int) or torch.device(device).type == "cuda")
 
 
-def _is_cpu(device: Any) -> bool:
+def _is_cpu(device):
     return torch.device(device).type == "cpu"

@@ -1,13 +1,11 @@
 """The metrics of the protocol in plain NumPy and scikit-image, independent of the package."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 from skimage.filters import scharr_h, scharr_v
 from skimage.metrics import structural_similarity
-
-Array = np.ndarray[Any, Any]
 
 LIGHTS = -np.array(
     [
@@ -27,104 +25,59 @@ class Intrinsics(NamedTuple):
     cx: float
     cy: float
 
-    def rays(self, height: int, width: int) -> Array:
+    def rays(self, height, width):
         """Return the rays with z = 1, (H, W, 3)."""
         v, u = np.mgrid[:height, :width]
         return np.stack(((u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(u.shape)), axis=-1)
 
 
-class Reference:
-    """The protocol, step by step; what is missing is NaN.
+def normals_of(points):
+    """Return the normals of points, (H, W, 3), by forward differences; NaN where a point that they need is."""
+    along_u = np.diff(points, axis=1)
+    along_u = np.concatenate((along_u, along_u[:, -1:]), axis=1)
+    along_v = np.diff(points, axis=0)
+    along_v = np.concatenate((along_v, along_v[-1:]), axis=0)
+    normals = np.cross(along_v, along_u)
+    return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
 
-    Args:
-        prediction: (H, W) orthogonal depth in metres.
-        target: likewise.
-        intrinsics: of the camera.
-        mask: (H, W), false where pixels are not counted.
 
+def reference_scores(prediction, target, intrinsics, mask=True):
+    """Return every metric of two maps of orthogonal depth, (H, W) metres, by its name in score files.
+
+    What is missing or masked is NaN on the way; a list has a value for each of the four lights.
     """
-
-    def __init__(self, prediction: Array, target: Array, intrinsics: Intrinsics, mask: Array | None = None) -> None:
-        known = np.isfinite(prediction) & np.isfinite(target) & (True if mask is None else mask)
-        self.depths = [np.where(known, z, np.nan) for z in (prediction, target)]
-        self.points = [z[..., None] * intrinsics.rays(*z.shape) for z in self.depths]
-        self.perspective = [np.linalg.norm(points, axis=-1) for points in self.points]
-        self.normals = [self._normals(points) for points in self.points]
-        self.shadings = [np.einsum("lc,hwc->lhw", LIGHTS, normals) for normals in self.normals]
-        self.renderings = [np.clip(shading, 0, 1) for shading in self.shadings]
-
-    @staticmethod
-    def _normals(points: Array) -> Array:
-        along_u = np.diff(points, axis=1)
-        along_u = np.concatenate((along_u, along_u[:, -1:]), axis=1)
-        along_v = np.diff(points, axis=0)
-        along_v = np.concatenate((along_v, along_v[-1:]), axis=0)
-        normals = np.cross(along_v, along_u)
-        return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
-
-    def rmse_d(self) -> float:
-        """Return the root mean square of differences of perspective depth."""
-        first, second = self.perspective
-        return float(np.sqrt(np.nanmean((first - second) ** 2)))
-
-    def bad_pix_d(self, threshold: float, *, relative: bool) -> float:
-        """Return the fraction of pixels whose perspective depth is off by more than a threshold."""
-        first, second = self.perspective
-        error = np.abs(first - second)[np.isfinite(first)]
-        limit = threshold * second[np.isfinite(first)] if relative else threshold
-        return float(np.mean(error > limit))
-
-    def rmse_v(self) -> float:
-        """Return the root mean square of differences of the first three shadings."""
-        first, second = (shadings[:3] for shadings in self.shadings)
-        return float(np.sqrt(np.nanmean((first - second) ** 2)))
-
-    def rmse_v1(self) -> list[float]:
-        """Return the same of each shading alone."""
-        first, second = self.shadings
-        return [float(np.sqrt(np.nanmean((first[i] - second[i]) ** 2))) for i in range(4)]
-
-    def bad_pix_v(self, threshold: float) -> list[float]:
-        """Return the fraction of pixels whose rendering is off by more than a threshold in 8-bit levels."""
-        first, second = self.renderings
-        known = np.isfinite(first[0])
-        return [float(np.mean(np.abs(first[i] - second[i])[known] > threshold / 255)) for i in range(4)]
-
-    def dssim_v(self) -> list[float]:
-        """Return one minus the mean structural similarity of each rendering."""
-        first, second = self.renderings
-        centres = np.isfinite(first[0])[3:-3, 3:-3]
-        values = []
-        for x, y in zip(np.nan_to_num(first), np.nan_to_num(second), strict=True):
-            ssim_map = structural_similarity(x, y, data_range=2, full=True)[1][3:-3, 3:-3]
-            values.append(1 - float(ssim_map[centres].mean()))
-        return values
-
-    def bumpiness_d(self) -> float:
-        """Return the clipped norm of second derivatives of the difference of disparities."""
-        first, second = self.depths
-        known = np.isfinite(first)
-        difference = 20.48 / np.where(known, first, 1.0) - 20.48 / np.where(known, second, 1.7)
-        squares = 0.0
-        for outer in (scharr_v, scharr_h):
-            derivative = _zero_border(outer(difference))
-            squares = squares + sum(_zero_border(inner(derivative)) ** 2 for inner in (scharr_v, scharr_h))
-        needed = ndimage.minimum_filter(known.astype(int), 5, mode="constant", cval=1) == 1
-        return float(100 * np.minimum(0.05, np.sqrt(squares))[needed].mean())
-
-    def all_metrics(self) -> dict[str, float | list[float]]:
-        """Return every metric by its name in score files; a list has a value for each of the four lights."""
-        return {
-            "RMSE_d": self.rmse_d(),
-            **{f"BadPix_d_{n}cm": self.bad_pix_d(n / 100, relative=False) for n in (1, 5, 10)},
-            **{f"BadPix_d_{n}pct": self.bad_pix_d(n / 100, relative=True) for n in (1, 5, 10)},
-            "RMSE_v": self.rmse_v(),
-            "RMSE_v1": self.rmse_v1(),
-            **{f"BadPix_v_{n}": self.bad_pix_v(n) for n in (1, 5, 10)},
-            "DSSIM_v": self.dssim_v(),
-            "Bumpiness_d": self.bumpiness_d(),
-        }
+    known = np.isfinite(prediction) & np.isfinite(target) & mask
+    points = [np.where(known, z, np.nan)[..., None] * intrinsics.rays(*z.shape) for z in (prediction, target)]
+    perspective = [np.linalg.norm(each, axis=-1) for each in points]
+    off, true = np.abs(perspective[0] - perspective[1])[known], perspective[1][known]
+    shadings = [np.einsum("lc,hwc->lhw", LIGHTS, normals_of(each)) for each in points]
+    squares = (shadings[0] - shadings[1]) ** 2
+    renderings = [np.clip(shading, 0, 1) for shading in shadings]
+    lit = np.isfinite(renderings[0][0]) & np.isfinite(renderings[1][0])
+    apart = np.abs(renderings[0] - renderings[1])[:, lit]
+    dissimilar = []
+    for x, y in zip(*map(np.nan_to_num, renderings), strict=True):
+        ssim_map = structural_similarity(x, y, data_range=2, full=True)[1][3:-3, 3:-3]
+        dissimilar.append(1 - float(ssim_map[lit[3:-3, 3:-3]].mean()))
+    return {
+        "RMSE_d": np.sqrt((off**2).mean()),
+        **{f"BadPix_d_{n}cm": np.mean(off > n / 100) for n in (1, 5, 10)},
+        **{f"BadPix_d_{n}pct": np.mean(off > n / 100 * true) for n in (1, 5, 10)},
+        "RMSE_v": np.sqrt(np.nanmean(squares[:3])),
+        "RMSE_v1": [np.sqrt(np.nanmean(each)) for each in squares],
+        **{f"BadPix_v_{n}": [np.mean(each > n / 255) for each in apart] for n in (1, 5, 10)},
+        "DSSIM_v": dissimilar,
+        "Bumpiness_d": _bumpiness(prediction, target, known),
+    }
 
 
-def _zero_border(values: Array) -> Array:
-    return np.pad(values[1:-1, 1:-1], 1)
+def _bumpiness(prediction, target, known):
+    """Return the clipped norm of second derivatives of the difference of disparities."""
+    difference = 20.48 / np.where(known, prediction, 1.0) - 20.48 / np.where(known, target, 1.7)
+    squares = 0.0
+    for outer in (scharr_v, scharr_h):
+        derivative = np.pad(outer(difference)[1:-1, 1:-1], 1)
+        for inner in (scharr_v, scharr_h):
+            squares = squares + np.pad(inner(derivative)[1:-1, 1:-1], 1) ** 2
+    needed = ndimage.minimum_filter(known.astype(int), 5, mode="constant", cval=1) == 1
+    return float(100 * np.minimum(0.05, np.sqrt(squares))[needed].mean())

@@ -12,37 +12,31 @@ import os
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import cv2
 import numpy as np
-import small_golden
 import torch
 from methods_at_hand import AT_HAND
-from reference_metrics import Array
+from reference_metrics import Intrinsics
 from small_scenes import seeded
 from torch import Tensor
 
 import dsr
 from dsr.data.reference_depth import fit, inpaint_depth
 from dsr.data.rendered import Procedural, SimGeo
-from dsr.degradation import holes as of_holes
-from dsr.degradation import noise as of_noise
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.degradation.holes import HOLES
-from dsr.degradation.noise import NOISES
+from dsr.degradation.holes import HOLES, Blobs, Shadows
+from dsr.degradation.noise import NOISES, GaussianMultiplicative, Kinect, TimeOfFlight
 from dsr.degradation.random_degradation import Everything
-from dsr.geometry.camera import from_range, to_range
 from dsr.geometry.hole_size import distance_to_known, wide_holes
 from dsr.geometry.mesh import triangulate
 from dsr.geometry.registration import find_displacement, find_edges, undo
 from dsr.geometry.resampling import pad_inverse_depth, resize_inverse_depth, warp_depth
-from dsr.geometry.surface import depth_to_normals, render, render_for_viewing
+from dsr.geometry.surface import depth_to_normals, render_for_viewing
 from dsr.inference.any_ratio import upsample_surface
 from dsr.inference.plausibility import find_outliers, within_measured
 from dsr.inference.sequences import View, fuse_views
@@ -56,13 +50,14 @@ from dsr.methods.weights import packaged_names, packaged_weights
 from dsr.sample import Scene
 from dsr.training.degradation import Degradation, to_tensors
 from dsr.training.module import SuperResolution
-from dsr.training.objective import DepthObjective, Objective, SurfaceObjective, balance_weight
+from dsr.training.objective import DepthObjective, SurfaceObjective, balance_weight
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings
 from dsr.utils import compute_device
 from dsr.utils.versions import RESULTS, SCENES, file_hash
 
 FILE = Path(__file__).resolve().parent / "golden" / "results.npz"
+INTRINSICS = Intrinsics(80.0, 76.0, 30.2, 33.1)
 TOLERANCE = 1e-4  # Relative: processors round differently
 _LOOSE = {"dip": 0.1, "srfs": 0.01, "pdn": 1e-3, "random": 1e-3, "facets": 5e-4, "bicubic 2": 5e-4, "loss mse": 5e-4}
 """Tolerances by how names begin, where iterations, levels of a photo or errors' own errors make more of roundings."""
@@ -73,10 +68,9 @@ _EVERYWHERE = ("facets", "msg_v", "bicubic", "bilateral", "guided_filter", "tgv"
 _NETWORKS = ("msg", "pdn", "dg", "ddrnet", "sparse_to_dense", "facets_box", "dip", "dip_v", "eg", "srfs")
 """Methods that are run at all ratios, and at those of networks alone, the last ones because they are slow."""
 _BLOCKS = 6
-Job = Callable[[], Any]
 
 
-def upsampling() -> Iterator[tuple[str, Job]]:
+def upsampling():
     """Yield upsampled maps and their expected errors: each method at each ratio, and what the options change."""
     for method in AT_HAND:
         settings = {"steps": 2} if method.startswith("dip") else {}
@@ -84,56 +78,48 @@ def upsampling() -> Iterator[tuple[str, Job]]:
         errors = method in ("facets", "bicubic", "msg_v")
         some = SIZES if method in _EVERYWHERE else ("2.67", "4") if method in _NETWORKS else ("1.4", "2.67", "8")
         for ratio in ("2", "4") if method == "msg_v_noisy" else some:
-            yield f"{method} {ratio}", _upsampled(ratio, method, errors=errors, **settings)
+            yield f"{method} {ratio}", partial(_upsampled, ratio, method, errors=errors, **settings)
     for method in ("dip", "dip_v"):
-        yield f"one step of {method}", _upsampled("4", method, steps=1)
+        yield f"one step of {method}", partial(_upsampled, "4", method, steps=1)
     for ratio in ("1", "2", "4", "8"):
         for method in ("facets", "msg_v", "guided_filter"):
-            yield f"{method} {ratio} scale=4", _upsampled(ratio, method, scale=4)
+            yield f"{method} {ratio} scale=4", partial(_upsampled, ratio, method, scale=4)
     for more in ({"fill": "none"}, {"fill": "all"}, {"max_hole": 8}, {"clean": True}, {"noise": 0.01}, {"smooth": 0},
                  {"smooth": 2}, {"edges": "soft"}, {"kernel": "bicubic"}, {"max_error": 0.02},
                  {"noise": 0.01, "noise_growth": 2.0}):  # fmt: skip
-        yield f"facets {more}", _upsampled("4", "facets", **more)
+        yield f"facets {more}", partial(_upsampled, "4", "facets", **more)
     for method in ("facets", "msg_v"):
-        yield f"{method} repeated", _repeated(method)
+        yield f"{method} repeated", partial(_repeated, method)
     for scale in (2, 4, 8, 16):
-        yield f"facets told x{scale}", _hinted(scale)
+        yield f"facets told x{scale}", partial(_hinted, scale)
     for size in (1.15, 1.35, 1.5):
-        yield f"nearly own size {size}", _of_size(round(64 / size))
+        yield f"nearly own size {size}", partial(_of_size, round(64 / size))
 
 
-def _upsampled(ratio: str, method: str, *, errors: bool = False, **more: Any) -> Job:
-    """Return the upsampling of the map of a ratio."""
-
-    def run() -> Any:
-        found = dsr.Upsampler(method, device="cpu", **more)(_photo(), _given(ratio), _camera())
-        return [found.depth, found.depth_error, found.angle_error] if errors else found.depth
-
-    return run
+def _upsampled(ratio, method, *, errors=False, **more):
+    """Return the upsampled map of a ratio, perhaps with its expected errors."""
+    found = dsr.Upsampler(method, device="cpu", **more)(_photo(), _given(ratio), _camera())
+    return [found.depth, found.depth_error, found.angle_error] if errors else found.depth
 
 
-def _of_size(size: int) -> Job:
+def _of_size(size):
     """Return the upsampling of a map of some size by a method that averages maps of the photo's size first."""
-    return lambda: dsr.upsample(_photo(), _reduced(size), _camera(), method="guided_filter", device="cpu")
+    return dsr.upsample(_photo(), _reduced(size), _camera(), method="guided_filter", device="cpu")
 
 
-def _repeated(method: str) -> Job:
+def _repeated(method):
     """Return the upsampling of a map that was enlarged by repeating pixels."""
     large = np.kron(_given("4"), np.ones((4, 4), np.float32))
-    return lambda: dsr.upsample(_photo(), large, _camera(), method=method, device="cpu")
+    return dsr.upsample(_photo(), large, _camera(), method=method, device="cpu")
 
 
-def _hinted(scale: int) -> Job:
+def _hinted(scale):
     """Return what facets makes of block means that it knows to be some."""
-
-    def run() -> Tensor:
-        method = read_recipe("facets").build(scale, Run(known=Known("box", "sharp", clean=True)))
-        return method(make_sample(_scene(), scale, Downsampling("box"), method.range_type))
-
-    return run
+    method = read_recipe("facets").build(scale, Run(known=Known("box", "sharp", clean=True)))
+    return method(make_sample(_scene(), scale, Downsampling("box"), method.range_type))
 
 
-def sensors() -> Iterator[tuple[str, Job]]:
+def sensors():
     """Yield what is found in maps of sensors, noise and its extent, the sensor, outliers, and what they lead to."""
     maps = {f"of {extent} pixels": _waves(extent) for extent in (1, 3, 6, 9, 12, 14, 16, 18, 20, 24)}
     maps |= {f"and {share:.0%} holes": _waves(8, holes=share) for share in (0.03, 0.06, 0.1)}
@@ -144,32 +130,28 @@ def sensors() -> Iterator[tuple[str, Job]]:
     rgb = torch.from_numpy(cv2.resize(_photo(), (192, 144))).permute(2, 0, 1) / 255
     camera = dsr.Camera(192, 144, 180.0, 180.0, 95.5, 71.5)
     large, large_rgb = camera.rescale(384, 288), rgb.repeat_interleave(2, 1).repeat_interleave(2, 2)
-
     slanted = (0.4 + 0.001 * torch.arange(192) + 0.0007 * torch.arange(144)[:, None]).double().reciprocal()[None]
 
-    def surface(extent: int, step: float | None = None, **more: Any) -> Job:
-        def run() -> list[Tensor]:
-            given = (_waves(extent) if step is None else (slanted / step).round() * step).float()
-            found = upsample_surface(rgb, given, camera, method="facets", device="cpu", **more)
-            return [found.depth, found.depth_error, found.angle_error]  # type: ignore[list-item]
-
-        return run
+    def surface(extent, step=None, **more):
+        given = (_waves(extent) if step is None else (slanted / step).round() * step).float()
+        found = upsample_surface(rgb, given, camera, method="facets", device="cpu", **more)
+        return [found.depth, found.depth_error, found.angle_error]
 
     yield "working size of a smaller map", lambda: upsample_surface(large_rgb, _waves(12).float(), large).depth
     for extent in (3, 12, 20):
-        yield f"working size of {extent} pixels", surface(extent)
+        yield f"working size of {extent} pixels", partial(surface, extent)
     for step in (0.02, 0.001, 0.0005):
-        yield f"rounded to {step} m", surface(1, step)
-    yield "working size 4", surface(3, working_size=4)
-    yield "RealSense D435", surface(12, sensor="RealSense D435")
-    yield "PrimeSense", surface(12, sensor="Kinect v1")
+        yield f"rounded to {step} m", partial(surface, 1, step)
+    yield "working size 4", partial(surface, 3, working_size=4)
+    yield "RealSense D435", partial(surface, 12, sensor="RealSense D435")
+    yield "PrimeSense", partial(surface, 12, sensor="Kinect v1")
     for strength in (1e-3, 2e-3, 3e-3, 4e-3, 6e-3):
         counted = ((348 / (348 / _waves(2, strength)).round()) * 1e4).round() / 1e4  # a Kinect's steps
         yield f"sensor at {strength}", lambda d=counted: _numbers(getattr(find_sensor(d), "constant", None))
     lost = _waves(1).clone()
     lost[:, 40:90, 60:66], lost[:, 60:68, 60:100] = torch.nan, torch.nan
     yield "glass", lambda: probability_of_glass(rgb, lost.reciprocal().float())
-    yield "Azure Kinect", surface(3, sensor="Azure Kinect")
+    yield "Azure Kinect", partial(surface, 3, sensor="Azure Kinect")
     speckled = _waves(1).clone()
     speckled[:, 40:44, 60:64] = 0.2
     speckled[:, 100:103, 20:24] = 30
@@ -180,73 +162,59 @@ def sensors() -> Iterator[tuple[str, Job]]:
     yield "outliers left out", lambda: upsample_surface(rgb, speckled.float(), camera, method="bicubic").depth
 
 
-def samples() -> Iterator[tuple[str, Job]]:
+def samples():
     """Yield low-resolution maps: of each downsampling model, noise and kind of holes."""
     scene, box = _scene(), Downsampling("box")
     for kernel in ("box", "nearest", "bilinear", "bicubic", "gaussian"):
         for kind in ("disparity", "orthogonal", "perspective"):
-            yield (
-                f"{kernel} of {kind}",
-                lambda kernel=kernel, kind=kind: make_sample(scene, 4, Downsampling(kernel), kind).depth_lr,
-            )
+            yield f"{kernel} of {kind}", partial(_low, scene, 4, Downsampling(kernel), kind)
     large = _large_scene()
-    assert large.depth is not None
-    holey = replace(
-        large, depth=large.depth.masked_fill(torch.rand((1, 192, 192), generator=seeded(0)) < 0.5, torch.nan)
-    )
+    holes = torch.rand((1, 192, 192), generator=seeded(0)) < 0.5
+    holey = replace(large, depth=large.depth.masked_fill(holes, torch.nan))
     for kernel in ("box", "bicubic", "gaussian"):
-        yield (
-            f"{kernel} of holes",
-            lambda kernel=kernel: make_sample(holey, 4, Downsampling(kernel), "disparity").depth_lr,
-        )
-    for name in ("GaussianMultiplicative", "TimeOfFlight", "Kinect"):
-        kind = getattr(of_noise, name)
-        noise = kind(0.01) if name == "GaussianMultiplicative" else kind()
-        yield f"noise {name}", lambda noise=noise: make_sample(large, 2, box, "disparity", noise).depth_lr
-    for name, kind in (("blobs", of_holes.Blobs), ("shadows", of_holes.Shadows)):
-        yield f"holes {name}", lambda kind=kind: make_sample(large, 2, box, "disparity", holes=kind()).depth_lr
+        yield f"{kernel} of holes", partial(_low, holey, 4, Downsampling(kernel), "disparity")
+    for noise in (GaussianMultiplicative(0.01), TimeOfFlight(), Kinect()):
+        yield f"noise {type(noise).__name__}", partial(_low, large, 2, box, "disparity", noise)
+    for name, kind in (("blobs", Blobs()), ("shadows", Shadows())):
+        yield f"holes {name}", partial(_low, large, 2, box, "disparity", holes=kind)
 
 
-def draws() -> Iterator[tuple[str, Job]]:
+def _low(*given, **more):
+    return make_sample(*given, **more).depth_lr
+
+
+def draws():
     """Yield random degradations of each kind."""
     only = Everything(holes={"none": 1}, told=1, relief=1, folds=1, textured=1, photo=1)
     for kind in NOISES:
         for scale in (1, 4):
-            yield f"random {kind} x{scale}", _degraded(replace(only, noises={kind: 1}, clear=1), scale)
+            yield f"random {kind} x{scale}", partial(_degraded, replace(only, noises={kind: 1}, clear=1), scale)
     for kind in HOLES:
-        yield f"random holes {kind}", _degraded(Everything(holes={kind: 1}), 2)
+        yield f"random holes {kind}", partial(_degraded, Everything(holes={kind: 1}), 2)
     for seed in range(6):
-        yield f"random {seed}", _degraded(Everything(), 2, seed)
+        yield f"random {seed}", partial(_degraded, Everything(), 2, seed)
     for name, share in vars(Everything()).items():
         if share is not None:
             values = share.values() if isinstance(share, dict) else [share]
             yield f"share of {name}", lambda values=values: _numbers(tuple(values))
     for kind in NOISES:
-        yield f"random {kind}, many", _drawn_often(Everything(noises={kind: 1}, holes={"none": 1}))
+        yield f"random {kind}, many", partial(_drawn_often, Everything(noises={kind: 1}, holes={"none": 1}))
 
 
-def _drawn_often(everything: Everything) -> Job:
+def _drawn_often(everything):
     """Return the means of many random maps of a part of the scene, each of which takes other branches."""
-
-    def run() -> Tensor:
-        part = _large_scene().crop(60, 60, 64, 64)
-        maps = [everything(part, 2, seeded(seed))[0].depth_lr for seed in range(24)]
-        return torch.stack([each.nanmean() for each in maps])
-
-    return run
+    part = _large_scene().crop(60, 60, 64, 64)
+    maps = [everything(part, 2, seeded(seed))[0].depth_lr for seed in range(24)]
+    return torch.stack([each.nanmean() for each in maps])
 
 
-def _degraded(everything: Everything, scale: int, seed: int = 0) -> Job:
+def _degraded(everything, scale, seed=0):
     """Return a randomly degraded map, its photo and the hints."""
-
-    def run() -> list[Tensor]:
-        sample, hints = everything(_large_scene(), scale, torch.Generator().manual_seed(seed))
-        return [sample.depth_lr, sample.rgb, sample.depth, hints.noise, hints.facts.double()]  # type: ignore[list-item]
-
-    return run
+    sample, hints = everything(_large_scene(), scale, seeded(seed))
+    return [sample.depth_lr, sample.rgb, sample.depth, hints.noise, hints.facts.double()]
 
 
-def training() -> Iterator[tuple[str, Job]]:
+def training():
     """Yield training patches, losses and the sizes of their gradients."""
     settings = PatchSettings(patch=48, batch=2)
     degradation = Degradation(4, Downsampling("box"))
@@ -261,50 +229,29 @@ def training() -> Iterator[tuple[str, Job]]:
     flat = replace(_scene(), depth=torch.full((1, 64, 64), 2.0, dtype=torch.float64))
     yield "range of a flat map", to_tensors(degradation.sample(flat))["min_max"].flatten
     yield "weight of the visual loss", lambda: _numbers(balance_weight([plain[0], plain[1]]))
-    for name, objective in (
-        ("lap1", DepthObjective(w=1.0)),
-        ("mse", DepthObjective("mse", shading=1.0)),
-        ("surface", SurfaceObjective()),
-    ):
-        yield f"loss {name}", _loss(objective, drawn if name == "surface" else plain)
+    yield "loss lap1", partial(_loss, DepthObjective(w=1.0), plain)
+    yield "loss mse", partial(_loss, DepthObjective("mse", shading=1.0), plain)
+    yield "loss surface", partial(_loss, SurfaceObjective(), drawn)
 
 
-def _loss(objective: Objective, patches: Patches) -> Job:
+def _loss(objective, patches):
     """Return the terms of a loss and the norm of its gradient, and the network's weights after a step."""
-
-    def run() -> list[Tensor]:
-        torch.manual_seed(0)
-        net = FacetsUNet(4) if isinstance(objective, SurfaceObjective) else MSGNet(4)
-        module = SuperResolution(net, objective)
-        batch = torch.utils.data.default_collate([patches[0], patches[1]])
-        terms = module.loss_terms(batch)
-        terms["loss"].backward()
-        norms = [p.grad.norm() for p in module.net.parameters() if p.grad is not None]
-        return [torch.stack([value.detach() for value in terms.values()]), torch.stack(norms)]
-
-    return run
+    torch.manual_seed(0)
+    net = FacetsUNet(4) if isinstance(objective, SurfaceObjective) else MSGNet(4)
+    module = SuperResolution(net, objective)
+    batch = torch.utils.data.default_collate([patches[0], patches[1]])
+    terms = module.loss_terms(batch)
+    terms["loss"].backward()
+    norms = [p.grad.norm() for p in module.net.parameters() if p.grad is not None]
+    return [torch.stack([value.detach() for value in terms.values()]), torch.stack(norms)]
 
 
-def geometry() -> Iterator[tuple[str, Job]]:
+def geometry():
     """Yield what cameras, surfaces, holes and edges are computed to be."""
     scene, camera = _scene(), _camera()
     depth = scene.depth
-    assert depth is not None
-    inverse, rays = depth.reciprocal(), camera.rays()
-    others = {
-        "rescaled": camera.rescale(24, 20), "reduced": camera.reduce(24, 24), "downscaled": camera.downscale(4),
-        "decimated": camera.decimate(4, 2.0), "rotated": camera.rotate90(1), "cropped": camera.crop(3, 5, 30, 40),
-        "of a field of view": dsr.Camera.from_fov(60, 64, 48),
-    }  # fmt: skip
-    for name, each in others.items():
-        yield f"rays {name}", each.rays
-    for kind in ("orthogonal", "perspective", "disparity"):
-        values = to_range(depth, camera, kind)  # type: ignore[arg-type]
-        yield f"range {kind}", lambda values=values: values
-        yield f"from range {kind}", lambda values=values, kind=kind: from_range(1.1 * values, camera, kind)
-    yield "normals", lambda: depth_to_normals(depth, rays)
-    yield "renderings", lambda: render(depth_to_normals(depth, rays)[None])[0]
-    yield "rendering to look at", lambda: render_for_viewing(depth_to_normals(depth, rays)[None])[0]
+    inverse = depth.reciprocal()
+    yield "rendering to look at", lambda: render_for_viewing(depth_to_normals(depth, camera.rays())[None])[0]
     holey = inverse.clone()
     holey[:, 20:31, 24:43] = torch.nan
     holey[:, 5, 5:50] = torch.nan
@@ -330,22 +277,20 @@ def geometry() -> Iterator[tuple[str, Job]]:
     noisy = [depth * (1 + 0.002 * torch.randn(depth.shape, generator=seeded(seed))) for seed in range(3)]
     pose = moved.numpy().copy()
 
-    def fused() -> list[Tensor]:
+    def fused():
         views = [View(each, camera, np.linalg.matrix_power(pose, number)) for number, each in enumerate(noisy)]
         found = fuse_views(views[0], views[1:])
         return [found.depth, found.votes.double()]
 
     yield "frames that vote", fused
     large = _large_scene()
-    assert large.depth is not None
     yield "edges", lambda: _numbers(sum(each.shape[1] for each in find_edges(large.depth[0].numpy(), 8, 0)))
     for shift, larger in ((5, 1.0), (0, 1.01), (0, 1.03), (3, 1.02)):
         yield f"displacement {shift}, {larger}", lambda shift=shift, larger=larger: _displaced(large, shift, larger)
 
 
-def _displaced(scene: Scene, shift: int, larger: float) -> list[Tensor]:
+def _displaced(scene, shift, larger):
     """Return the displacement that is found of a map that is moved and magnified, and the map without it."""
-    assert scene.depth is not None
     size = round(192 * larger)
     depth = torch.nn.functional.interpolate(scene.depth[None], (size, size), mode="nearest-exact")
     start = (size - 192) // 2
@@ -357,10 +302,10 @@ def _displaced(scene: Scene, shift: int, larger: float) -> list[Tensor]:
     return [_numbers((found.down, found.right, found.scale)), undo(depth_lr, found)]
 
 
-def scenes() -> Iterator[tuple[str, Job]]:
+def scenes():
     """Yield the name and the function of each prepared scene."""
     scene = _scene()
-    depth = scene.depth.clone()  # type: ignore[union-attr]
+    depth = scene.depth.clone()
     depth[:, 20:31, 24:43] = torch.nan
     holey = replace(scene, depth=depth)
     for size in (24, 48, 64, 90):
@@ -392,37 +337,50 @@ GROUPS = {
 
 
 @cache
-def _scene() -> Scene:
-    """Return the small scene of the project, 64 x 64, with a little grain in its photo."""
-    depth, rgb = small_golden.trace()
+def _scene():
+    """Return a wall, a floor and a ball, 64 x 64, traced in closed form without the package; grain in the photo."""
+    rays = INTRINSICS.rays(64, 64)
+    wall = 3.2 / (rays @ np.array([0.2, 0.0, 1.0]))
+    downward = rays[..., 1]
+    floor = np.where(downward > 0, 0.7 / np.where(downward > 0, downward, 1.0), np.inf)
+    centre = np.array([0.1, 0.15, 2.2])
+    along, squared = rays @ centre, (rays**2).sum(axis=-1)
+    root = along**2 - squared * (centre @ centre - 0.45**2)
+    ball = np.where(root > 0, (along - np.sqrt(np.maximum(root, 0))) / squared, np.inf)
+    depths = np.stack((wall, floor, ball))
+    depth, body = depths.min(axis=0), depths.argmin(axis=0)
+    x, _, z = np.moveaxis(depth[..., None] * rays, -1, 0)
+    checks = (np.floor(4 * x) + np.floor(4 * z)) % 2
+    colours = np.array([[180, 170, 150], [120, 90, 60], [60, 110, 190]])[body]
+    rgb = (colours - 30 * checks[..., None]).astype(np.uint8)
     grain = np.random.default_rng(0).normal(0, 6, (64, 64, 1))
     pixels = torch.from_numpy(np.clip(rgb + grain, 0, 255).astype(np.uint8)).permute(2, 0, 1) / 255
-    return Scene("golden", "small", pixels, _camera(), torch.from_numpy(depth.astype(np.float64))[None])
+    true = torch.from_numpy(depth.astype(np.float32).astype(np.float64))[None]
+    return Scene("golden", "small", pixels, _camera(), true)
 
 
-def _photo() -> Array:
+def _photo():
     """Return the photo as bytes, (64, 64, 3)."""
     return (_scene().rgb * 255).round().byte().permute(1, 2, 0).numpy()
 
 
-def _camera() -> dsr.Camera:
-    return dsr.Camera(small_golden.SIZE, small_golden.SIZE, *small_golden.INTRINSICS)
+def _camera():
+    return dsr.Camera(64, 64, *INTRINSICS)
 
 
 @cache
-def _reduced(size: int) -> Array:
+def _reduced(size):
     """Return means of inverse depth over the pixels of a smaller map, as depth."""
     edges = np.arange(size + 1) * (64 / size)
     low, high = edges[:-1, None], edges[1:, None]
     pixels = np.arange(64)
     weights = np.clip(np.minimum(high, pixels + 1) - np.maximum(low, pixels), 0, None) / (high - low)
     depth = _scene().depth
-    assert depth is not None
     return (1 / (weights @ (1 / depth[0].numpy()) @ weights.T)).astype(np.float32)
 
 
 @cache
-def _given(ratio: str) -> Array:
+def _given(ratio):
     """Return the map of a ratio, with holes, and with noise at some ratios."""
     size = SIZES[ratio]
     depth = _reduced(size).copy()
@@ -435,15 +393,10 @@ def _given(ratio: str) -> Array:
     return depth
 
 
-def _waves(extent: float, strength: float = 0.004, *, floor: float = 1.0, holes: float = 0.0) -> Tensor:
-    """Return depth of a floor, a wall and a box, (1, 144, 192), with noise that is alike over some pixels.
+def _waves(extent, strength=0.004, *, floor=1.0, holes=0.0):
+    """Return depth of a floor, a wall and a box, (1, 144, 192), with noise that is alike over ``extent`` pixels.
 
-    Args:
-        extent: these pixels.
-        strength: relative standard deviation of the noise.
-        floor: least part of it, in the left of the map; all in the right.
-        holes: share of the pixels that are missing.
-
+    ``strength`` is its relative standard deviation, ``floor`` its least part, in the left of the map.
     """
     v, u = np.mgrid[:144, :192].astype(np.float64)
     inverse = np.where(v > 96, 0.4 + 0.003 * (v - 96), 0.4 + 0.0003 * u)
@@ -459,7 +412,7 @@ def _waves(extent: float, strength: float = 0.004, *, floor: float = 1.0, holes:
 
 
 @cache
-def _large_scene() -> Scene:
+def _large_scene():
     """Return a scene of 192 x 192 pixels: surfaces with and without depth steps between them, and a photo of them."""
     v, u = np.mgrid[:192, :192].astype(np.float64)
     depth = np.where(v > 130, 240 / (v + 1), 240 / 131 + 0.001 * (130 - v))
@@ -473,20 +426,20 @@ def _large_scene() -> Scene:
     return Scene("golden", "large", torch.from_numpy(rgb).float(), camera, torch.from_numpy(depth)[None])
 
 
-def _stairs() -> Tensor:
+def _stairs():
     """Return depth, (1, 64, 64), with steps of 0.3 to 14 % along both axes, between surfaces that slope."""
     steps = np.cumsum(np.where(np.arange(64) % 4 == 0, np.linspace(0.003, 0.12, 64), 0.001))
     down = np.cumsum(np.where(np.arange(64) % 8 == 0, np.linspace(0.02, 0.005, 64), 0.0005))
     return torch.from_numpy(np.exp(0.5 + steps - down[:, None]))[None]
 
 
-def _numbers(values: Any) -> Tensor:
+def _numbers(values):
     """Return one or several numbers, or NaN for none, as a tensor."""
     values = values if isinstance(values, tuple) else (values,)
     return torch.tensor([math.nan if each is None else float(each) for each in values], dtype=torch.float64)
 
 
-def compute(jobs: Iterator[tuple[str, Job]]) -> dict[str, Array]:
+def compute(jobs):
     """Return the summary of each result, in float32 also where bfloat16 is faster."""
     found = {}
     with mock.patch.object(compute_device, "_FAST_ON_CPU", ()):
@@ -497,7 +450,7 @@ def compute(jobs: Iterator[tuple[str, Job]]) -> dict[str, Array]:
     return found
 
 
-def summary(values: Tensor | Array) -> Array:
+def summary(values):
     """Return the means and standard deviations of the known values of 6 x 6 blocks, and the share of known values.
 
     Of one row of numbers, these.
@@ -513,7 +466,7 @@ def summary(values: Tensor | Array) -> Array:
     return np.concatenate([*parts, [np.isfinite(found).mean()]]).astype(np.float32)
 
 
-def differing(before: dict[str, Array], now: dict[str, Array]) -> list[str]:
+def differing(before, now):
     """Return the names of results that differ, with how much."""
     lines = [f"{name}: {'new' if name in now else 'missing'}" for name in sorted(before.keys() ^ now.keys())]
     for name in (name for name in before if name in now):
@@ -529,18 +482,18 @@ def differing(before: dict[str, Array], now: dict[str, Array]) -> list[str]:
     return lines
 
 
-def read() -> tuple[dict[str, int | str], dict[str, dict[str, Array]]]:
+def read():
     """Return the versions in the file, and the results of each group."""
     with np.load(FILE) as file:
         parts = np.split(file["values"], np.cumsum(file["sizes"])[:-1])
-        found: dict[str, dict[str, Array]] = {}
+        found = {}
         for name, part in zip(file["names"].tolist(), parts, strict=True):
             group, _, rest = name.partition(": ")
             found.setdefault(group, {})[rest] = part
         return {name: file[name].item() for name in VERSIONS}, found
 
 
-def write(found: dict[str, dict[str, Array]]) -> None:
+def write(found):
     """Write the results of all groups, with 16 of the 23 bits of each number, which take half the room."""
     results = {f"{group}: {name}": values for group, now in found.items() for name, values in now.items()}
     values = np.concatenate(list(results.values())).view(np.uint32)
@@ -549,7 +502,7 @@ def write(found: dict[str, dict[str, Array]]) -> None:
     np.savez_compressed(FILE, values=rounded, sizes=sizes, names=list(results), **VERSIONS)
 
 
-def main() -> None:
+def main():
     """Write the file, unless results change whose version does not."""
     os.environ["DSR_CACHE"] = tempfile.mkdtemp()
     torch.set_num_threads(1)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, Kernel, make_sample
@@ -26,6 +27,11 @@ def sample_of(
 def seeded(seed: int = 0) -> torch.Generator:
     """Return a generator of its own."""
     return torch.Generator().manual_seed(seed)
+
+
+def normal(*shape: int, seed: int = 0) -> Tensor:
+    """Return normally distributed numbers, float64."""
+    return torch.randn(shape, generator=seeded(seed), dtype=torch.float64)
 
 
 def grid(height: int, width: int) -> tuple[Tensor, ...]:
@@ -65,6 +71,23 @@ def photos(height: int, width: int, count: int = 1) -> Tensor:
 def maps(height: int, width: int, count: int = 1) -> Tensor:
     """Return random disparities, (B, 1, H, W)."""
     return 20 + 9 * torch.rand((count, 1, height, width), generator=torch.Generator().manual_seed(2)).double()
+
+
+def sphere_depth(rays: Tensor, centre: ArrayLike, radius: float) -> Tensor:
+    """Return the depth, (H, W), at which rays with z = 1, (3, H, W), meet a sphere; infinity where they miss it."""
+    middle = torch.as_tensor(centre, dtype=torch.float64)[:, None, None]
+    square, half = rays.square().sum(dim=0), (rays * middle).sum(dim=0)
+    root = half.square() - square * (middle.square().sum() - radius**2)
+    return torch.where(root > 0, (half - root.clamp(min=0).sqrt()) / square, torch.inf)
+
+
+def problem(scale: float, height: int, width: int, doffs: float = 0.0) -> DepthSample:
+    """Return the problem of a random low-resolution map of this size and a random photo, without the truth."""
+    fine = round(scale * height), round(scale * width)
+    camera = Camera(fine[1], fine[0], 600.0, 600.0, 3.0, 4.0, baseline=0.2, doffs=doffs)
+    low = camera.rescale(width, height)
+    depth = from_range(maps(height, width)[0] * (width / fine[1]), low, "disparity")
+    return DepthSample("test", "scene", photos(*fine)[0], depth, camera, low, scale)
 
 
 def plane_map(height: int, width: int, along_u: float = 0.3, along_v: float = -0.2) -> Tensor:

@@ -1,23 +1,20 @@
 """The scenes and the perceptual network that golden results are of."""
 
-from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 
 import pytest
 
 from dsr.data.folder import Folder
-from dsr.metrics.lpips import LPIPS, load_lpips
-from dsr.sample import Scene
+from dsr.metrics.lpips import load_lpips
 
 
 @pytest.fixture(scope="session")
-def network(shared: Path) -> LPIPS:
+def network(shared):
     """LPIPS with its published weights."""
     return load_lpips(shared / "weights" / "alexnet_imagenet_features.pth")
 
 
 @pytest.fixture(scope="session")
-def load_scene(shared: Path) -> Callable[[str], Scene]:
+def load_scene(shared):
     """Return what loads Lucy or Plant, once."""
     return cache(lambda name: Folder(str(shared / "scenes"), [name]).load(name))

@@ -5,25 +5,19 @@
 
 import csv
 import json
-from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from dsr.data.ddrnet_frames import DDRNetFrames
 from dsr.data.eight_bit import EightBit
 from dsr.data.rgbdd import RGBDD
-from dsr.data.scene_source import SceneSource
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.geometry.camera import RangeType
-from dsr.methods.base import Method
 from dsr.methods.classical.interpolation import CubicConvolution
-from dsr.methods.networks.peers.peer import Peer
+from dsr.methods.recipe import read_recipe
 from dsr.metrics.catalogue import catalogue, score_image
 from dsr.metrics.formats import HEADLINES
 
@@ -41,10 +35,9 @@ IMAGES = {
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_sensor_scores_equal_the_golden_file(shared: Path, frame: str) -> None:
+def test_sensor_scores_equal_the_golden_file(shared, frame):
     expected = json.loads((shared / "expected" / "real_sensor.json").read_text())["frames"][frame]
     scene = DDRNetFrames(str(shared / "real" / "ddrnet"), "found").load(frame)
-    assert scene.depth is not None
     raw = scene.measured[1]
     filtered = cv2.bilateralFilter(raw[0].nan_to_num(0).float().numpy(), 19, 0.03, 3).astype(np.float64)
     maps = {"input": raw, "bilateral_19_0.03_3": torch.from_numpy(np.where(filtered > 0, filtered, np.nan))[None]}
@@ -57,7 +50,7 @@ def test_sensor_scores_equal_the_golden_file(shared: Path, frame: str) -> None:
 
 
 @cache
-def _published(shared: Path, benchmark: str, method: str, scale: int) -> dict[str, float]:
+def _published(shared, benchmark, method, scale):
     """Return the RMSE of each image, by its name."""
     part = (f"protocol:{benchmark}", method, str(scale), "pillow-bicubic", "RMSE")
     with (shared / "expected" / "peers.csv").open(newline="", encoding="utf-8") as file:
@@ -65,40 +58,52 @@ def _published(shared: Path, benchmark: str, method: str, scale: int) -> dict[st
     return {row[2].partition("_output")[0].partition("_HR")[0]: float(row[6]) for row in rows}
 
 
-def _source(shared: Path, benchmark: str) -> tuple[SceneSource, RangeType]:
+def _source(shared, benchmark, images):
     """Return a benchmark's images, and the range type that it downsamples."""
     root = str(shared / "modern" / benchmark)
     if benchmark == "RGBDD":
-        return RGBDD(root, real=False, scenes=IMAGES[benchmark]), "orthogonal"
-    return EightBit(root, "lu" if benchmark == "Lu" else "middlebury8", IMAGES[benchmark]), "disparity"
+        return RGBDD(root, real=False, scenes=images), "orthogonal"
+    return EightBit(root, "lu" if benchmark == "Lu" else "middlebury8", images), "disparity"
 
 
-def _rmse(source: SceneSource, kind: RangeType, method: Method, scale: int) -> Iterator[tuple[str, float]]:
-    """Yield the RMSE of each image in the benchmark's unit."""
+def _rmse(source, kind, method, scale, multiple=1):
+    """Return the RMSE of each image, cropped to a multiple, in the benchmark's unit."""
+    found = {}
     for name in source.scenes():
-        sample = make_sample(source.load(name), scale, Downsampling("bicubic"), kind)
-        assert sample.depth is not None
-        truth: Tensor = sample.depth.double()
-        metrics = catalogue(protocols=("field",))
-        rows = score_image(method(sample).double(), truth, sample.camera.rays(), metrics, sample.unit)
-        yield name, next(row.value for row in rows if row.metric in ("RMSE_levels", "RMSE_cm"))
+        scene = source.load(name)
+        height, width = (n // multiple * multiple for n in (scene.camera.height, scene.camera.width))
+        sample = make_sample(scene.crop(0, 0, height, width), scale, Downsampling("bicubic"), kind)
+        maps, metrics = (method(sample).double(), sample.depth.double()), catalogue(protocols=("field",))
+        rows = score_image(*maps, sample.camera.rays(), metrics, sample.unit)
+        found[name] = next(row.value for row in rows if row.metric in ("RMSE_levels", "RMSE_cm"))
+    return found
 
 
 @pytest.mark.parametrize("scale", [4, 8])
 @pytest.mark.parametrize("benchmark", IMAGES)
-def test_bicubic_has_the_errors_of_the_fields_protocol(shared: Path, benchmark: str, scale: int) -> None:
-    source, kind = _source(shared, benchmark)
-    found = dict(_rmse(source, kind, CubicConvolution(kind), scale))
+def test_bicubic_has_the_errors_of_the_fields_protocol(shared, benchmark, scale):
+    source, kind = _source(shared, benchmark, IMAGES[benchmark])
     published = _published(shared, benchmark, "bicubic", scale)
-    assert found == pytest.approx({name: published[name] for name in IMAGES[benchmark]}, rel=1e-3)
+    expected = {name: published[name] for name in IMAGES[benchmark]}
+    assert _rmse(source, kind, CubicConvolution(kind), scale) == pytest.approx(expected, rel=1e-3)
 
 
-def test_dctnet_has_its_authors_errors_on_lu_with_the_true_range(shared: Path) -> None:
-    scale = 8  # at 4 its depth is compared in test_peers_golden
-    source, kind = _source(shared, "Lu")
-    file = f"DCTNet_{scale}X.pth"
-    method = Peer("dctnet", shared / "weights" / "peers" / file, scale, {file: scale}, kind, range="truth")
-    published = _published(shared, "Lu", "DCTNet", scale)
-    assert dict(_rmse(source, kind, method, scale)) == pytest.approx(
-        {name: published[name] for name in IMAGES["Lu"]}, rel=1e-4
-    )
+@pytest.mark.parametrize(
+    ("method", "benchmark", "image", "scale", "multiple", "tolerance"),
+    [
+        ("DCTNet", "Lu", "RGBD_03", 8, 1, 1e-4),  # at 4 its depth is compared in test_peers_golden
+        # of PGSR the published errors take the range of the image before its crop
+        pytest.param("PGSR", "Lu", "RGBD_01", 4, 16, 3e-3, marks=pytest.mark.nightly),
+        pytest.param("PGSR", "Middlebury", "Middlebury_02", 8, 16, 3e-3, marks=pytest.mark.nightly),
+        pytest.param("PGSR", "RGBDD", "20200518161728", 4, 16, 3e-3, marks=pytest.mark.nightly),
+    ],
+)
+def test_networks_have_their_authors_errors_with_the_true_range(
+    shared, method, benchmark, image, scale, multiple, tolerance
+):
+    source, kind = _source(shared, benchmark, (image,))
+    recipe = read_recipe(method.lower(), {"range": "truth", "range_type": kind})
+    upsampler = recipe.with_weights(shared / "weights" / "peers").build(scale)
+    assert upsampler.flag == "true-range"
+    expected = {image: _published(shared, benchmark, method, scale)[image]}
+    assert _rmse(source, kind, upsampler, scale, multiple) == pytest.approx(expected, rel=tolerance)

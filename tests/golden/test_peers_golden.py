@@ -1,28 +1,19 @@
 """Published networks of the field with their authors' weights, against maps and scores of the authors' own code."""
 
-from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
 
-from dsr.data.eight_bit import EightBit
-from dsr.data.rgbdd import RGBDD
-from dsr.data.scene_source import SceneSource
 from dsr.degradation.downsampling import Downsampling, make_sample
-from dsr.geometry.camera import RangeType
 from dsr.methods.recipe import read_recipe
 from dsr.metrics.catalogue import catalogue, score_image
-from dsr.metrics.lpips import LPIPS
-from dsr.sample import Scene
 
 pytestmark = pytest.mark.nightly  # only a change in methods/networks/peers can break them
-Load = Callable[[str], Scene]
 NAMES = {"pgsr": "PGSR", "dctnet": "DCTNet", "dornet": "DORNet-T", "svlrm": "SVLRM", "fdkn": "FDKN"}
-FEEDS: dict[str, tuple[Downsampling, RangeType]] = {
+FEEDS = {
     "box-disp": (Downsampling("box"), "disparity"),
     "box-depth": (Downsampling("box", range_type="disparity"), "orthogonal"),
     "bic-disp": (Downsampling("bicubic"), "disparity"),
@@ -48,7 +39,7 @@ SLOW = ("LPIPS_v", "Bumpiness_d")
 
 
 @cache
-def _predict(shared: Path, load_scene: Load, name: str, method: str, scale: int, variant: str) -> torch.Tensor:
+def _predict(shared, load_scene, name, method, scale, variant):
     downsampling, range_type = FEEDS[variant]
     weights = shared / "weights" / "peers"
     upsampler = read_recipe(method, {"range_type": range_type}).with_weights(weights).build(scale)
@@ -56,7 +47,7 @@ def _predict(shared: Path, load_scene: Load, name: str, method: str, scale: int,
 
 
 @pytest.mark.parametrize(("method", "scale"), TRAINED)
-def test_depth_is_that_of_the_authors_code(shared: Path, load_scene: Load, method: str, scale: int) -> None:
+def test_depth_is_that_of_the_authors_code(shared, load_scene, method, scale):
     file = shared / "expected" / f"peer_{NAMES[method]}_lucy_x{scale}_box_disparity.npz"
     expected = torch.from_numpy(np.load(file)["depth"]).double()
     ours = _predict(shared, load_scene, "lucy", method, scale, "box-disp")[0]
@@ -65,14 +56,11 @@ def test_depth_is_that_of_the_authors_code(shared: Path, load_scene: Load, metho
 
 
 @pytest.mark.parametrize(("name", "method", "scale", "variant"), SETTINGS)
-def test_scores_are_those_of_the_authors_code(
-    shared: Path, load_scene: Load, network: LPIPS, name: str, method: str, scale: int, variant: str
-) -> None:
+def test_scores_are_those_of_the_authors_code(shared, load_scene, network, name, method, scale, variant):
     rows = pd.read_csv(shared / "expected" / "peers.csv", dtype={"scale": int})
     rows = rows[(rows["part"] == "scenes") & (rows["method"] == NAMES[method]) & (rows["scene"] == name)]
     expected = rows[(rows["scale"] == scale) & (rows["variant"] == variant)].set_index("metric")["value"]
     scene = load_scene(name)
-    assert scene.depth is not None
     depth = _predict(shared, load_scene, name, method, scale, variant)
     everything = (name, variant) == ("lucy", "box-disp")
     wanted = {metric for metric, _ in COLUMNS.values() if everything or metric not in SLOW}
@@ -83,41 +71,3 @@ def test_scores_are_those_of_the_authors_code(
     for column, (metric, factor) in COLUMNS.items():
         if metric in wanted:
             assert factor * ours[metric] == pytest.approx(expected[column], rel=0.01), column
-
-
-FIELD = [  # DCTNet on Lu's images is in test_benchmarks_golden
-    ("pgsr", "lu", "RGBD_01_output_depth", 4),
-    ("pgsr", "middlebury8", "Middlebury_02_output_depth", 8),
-    ("pgsr", "rgbdd", "20200518161728_HR_gt", 4),
-]
-
-
-@pytest.mark.parametrize(("method", "dataset", "image", "scale"), FIELD)
-def test_field_scores_with_the_true_range_are_those_of_the_authors_code(
-    shared: Path, method: str, dataset: str, image: str, scale: int
-) -> None:
-    rows = pd.read_csv(shared / "expected" / "peers.csv", dtype={"scale": int})
-    rows = rows[(rows["method"] == NAMES[method]) & (rows["scene"] == f"{image}.png") & (rows["metric"] == "RMSE")]
-    expected = rows[rows["scale"] == scale]["value"].item()
-    source = _field_source(shared, dataset)
-    scene = source.load(next(name for name in source.scenes() if image.startswith(name)))
-    height, width = (n // 16 * 16 for n in (scene.camera.height, scene.camera.width))
-    scene = scene.crop(0, 0, height, width)
-    settings = {"range": "truth", "range_type": "disparity" if scene.unit.inverse else "orthogonal"}
-    upsampler = read_recipe(method, settings).with_weights(shared / "weights" / "peers").build(scale)
-    assert upsampler.flag == "true-range"
-    depth = upsampler(make_sample(scene, scale, Downsampling("bicubic"), upsampler.range_type))
-    assert scene.depth is not None
-    found, truth = (scene.unit.convert(each) for each in (depth, scene.depth))
-    if scene.unit.limits is not None:
-        found = found.clamp(*scene.unit.limits)
-    rmse = float((found - truth).square().mean().sqrt())
-    assert rmse == pytest.approx(expected, rel=3e-3)  # the expected values take the range of the image before its crop
-
-
-def _field_source(shared: Path, dataset: str) -> SceneSource:
-    modern = shared / "modern"
-    if dataset == "rgbdd":
-        return RGBDD(str(modern / "RGBDD"), real=False, scenes="found")
-    folder = {"lu": "Lu", "middlebury8": "Middlebury"}[dataset]
-    return EightBit(str(modern / folder), dataset)

@@ -2,27 +2,24 @@
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
 import pytest
 import torch
 from commands import run_python
-from torch import Tensor
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.methods.recipe import read_recipe
-from dsr.metrics.catalogue import Metric, catalogue, score_image
+from dsr.metrics.catalogue import catalogue, score_image
 from dsr.metrics.formats import WORST
-from dsr.sample import DepthSample, Scene
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 VISUAL = ("RMSE_v", "DSSIM_v", "BadPix_v_5", "Bumpiness_d", "LPIPS_v")
 
 
 @pytest.fixture(scope="module")
-def ratios(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
+def ratios(shared, tmp_path_factory):
     """Ours / published MSG-V on Lucy and Plant at x4, one pass each, as the benchmark prints them."""
     file = tmp_path_factory.mktemp("ratios") / "ratios.json"
     script = str(REPOSITORY / "benchmarks" / "run.py")
@@ -36,9 +33,7 @@ def ratios(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> pd.DataFra
 
 
 @pytest.mark.parametrize(("method", "rmse_v", "all_metrics"), [("msg_v", 0.85, 0.93), ("facets", 0.75, 0.80)])
-def test_our_networks_beat_the_published_one_in_every_visual_metric_of_every_case(
-    ratios: pd.DataFrame, method: str, rmse_v: float, all_metrics: float
-) -> None:
+def test_our_networks_beat_the_published_one_in_every_visual_metric_of_every_case(ratios, method, rmse_v, all_metrics):
     ours = ratios[ratios["method"] == method]
     assert len(ours) == 2
     assert float(ours[[*VISUAL]].max().max()) < 1.0
@@ -46,7 +41,7 @@ def test_our_networks_beat_the_published_one_in_every_visual_metric_of_every_cas
     assert float(ours[[*VISUAL]].mean().mean()) < all_metrics
 
 
-def test_visual_loss_shows_on_lucy_and_plant(ratios: pd.DataFrame) -> None:
+def test_visual_loss_shows_on_lucy_and_plant(ratios):
     cases = ratios.set_index(["scale", "scene"])
     gain = cases[cases["method"] == "msg_v"][[*VISUAL]] / cases[cases["method"] == "msg"][[*VISUAL]]
     assert gain.shape == (2, len(VISUAL))
@@ -58,21 +53,14 @@ def test_visual_loss_shows_on_lucy_and_plant(ratios: pd.DataFrame) -> None:
     "name",
     ["sparse_to_dense_x4", "sparse_to_dense_x8", "ddrnet_x4", pytest.param("ddrnet_x8", marks=pytest.mark.nightly)],
 )
-def test_scores_on_lucy_are_those_that_the_recipe_expects(load_scene: Callable[[str], Scene], name: str) -> None:
+def test_scores_on_lucy_are_those_that_the_recipe_expects(load_scene, name):
     header = (REPOSITORY / "conf" / "experiment" / f"{name}.yaml").read_text(encoding="utf-8")
     found = re.search(r"Expected: .*Lucy (\d+) / (\d+) / (\d+),", header)
-    assert found is not None
     model, _, scale = name.rpartition("_x")
     method = read_recipe(model).build(int(scale))
     sample = make_sample(load_scene("lucy"), int(scale), Downsampling("box"), method.range_type)
-    scores = _worst(method(sample), sample, catalogue())
+    with torch.inference_mode():
+        rows = score_image(method(sample), sample.depth, sample.camera.rays(), catalogue())
+    scores = {row.metric: row.value for row in rows if row.variant in ("", WORST)}
     measured = [1000 * scores["RMSE_v"], 1000 * scores["DSSIM_v"], 1000 * scores["RMSE_d"]]
     assert measured == pytest.approx([float(each) for each in found.groups()], abs=0.6)
-
-
-@torch.inference_mode()
-def _worst(depth: Tensor, sample: DepthSample, metrics: tuple[Metric, ...]) -> dict[str, float]:
-    """Return the scores, under the worst of the four lights."""
-    assert sample.depth is not None
-    rows = score_image(depth, sample.depth, sample.camera.rays(), metrics)
-    return {row.metric: row.value for row in rows if row.variant in ("", WORST)}

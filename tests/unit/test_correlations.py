@@ -1,4 +1,4 @@
-"""The metric study: what is a point, what is correlated, and that the figures show it."""
+"""Statistics of reports: correlations of metrics, intervals of means over scenes, and paired tests between methods."""
 
 import math
 
@@ -6,12 +6,14 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy import stats
+from scipy.stats import bootstrap, permutation_test
 from small_runs import made_up_run
 
 from dsr.evaluation.results import Results
 from dsr.report import correlations
 from dsr.report.correlations import correlate, metric_matrix, save_scatter_matrix, with_reference, write_correlations
 from dsr.report.paper import published
+from dsr.report.significance import interval_of_mean, p_of_difference
 
 VARIANTS = ("e1", "e2", "e3", "e4", "max", "avg")
 
@@ -98,3 +100,36 @@ def test_missing_lpips_leaves_the_rest_and_one_line_says_so(tmp_path, monkeypatc
     save_scatter_matrix(results, tmp_path)
     assert list(drawn) == ["scatter_matrix.pdf", "scatter_matrix.png"]
     assert "no LPIPS_v in these results" in drawn["scatter_matrix.pdf"].texts[0].get_text()
+
+
+def test_interval_of_many_scenes_is_that_of_another_bootstrap():
+    values = np.random.default_rng(1).gamma(2, size=200)
+    theirs = bootstrap((values,), np.mean, n_resamples=10_000, method="percentile", rng=0).confidence_interval
+    assert interval_of_mean(values.tolist()) == pytest.approx(theirs, rel=0.02)
+
+
+def test_interval_of_few_scenes_holds_the_mean_about_as_often_as_it_says():
+    random = np.random.default_rng(4)
+    bounds = np.array([interval_of_mean(random.normal(0, 1, 6).tolist()) for _ in range(400)])
+    assert ((bounds[:, 0] <= 0) & (bounds[:, 1] >= 0)).mean() > 0.92
+
+
+def test_few_scenes_have_no_interval_and_no_significant_difference():
+    assert interval_of_mean([1, 2, 3, 4]) is None
+    assert p_of_difference([1, 2, 3, 4, 5], [5, 6, 7, 8, 9]) == 2 / 32
+
+
+def test_exact_test_is_that_of_another_library():
+    first, second = np.random.default_rng(5).normal([[0.8], [0]], 1, (2, 9))
+    theirs = permutation_test((first, second), lambda a, b: np.mean(a - b), permutation_type="samples").pvalue
+    assert p_of_difference(first.tolist(), second.tolist()) == pytest.approx(theirs)
+
+
+def test_scenes_are_paired():
+    random = np.random.default_rng(2)
+    scenes = random.normal(0, 10, 12)
+    better, worse = scenes, scenes + 1 + random.normal(0, 0.1, 12)
+    assert p_of_difference(better, worse) < 0.001
+    assert p_of_difference(better, random.permutation(worse)) > 0.05
+    assert p_of_difference(better, worse) == p_of_difference(worse, better)
+    assert p_of_difference(better, better) == 1

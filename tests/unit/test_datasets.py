@@ -5,12 +5,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from dsr.data.icl import FRAMES as ICL_FRAMES
 from dsr.data.icl import ICL
 from dsr.data.middlebury import EVALUATION_2014, TRAINING, Middlebury, MiddleburyLevels, MiddleburyTrain
 from dsr.data.rendered import Procedural, SimGeo
 from dsr.data.scene_source import Preparation
-from dsr.data.sunrgbd import FRAMES as SUN_FRAMES
 from dsr.data.sunrgbd import SunRGBD
 from dsr.data.tofmark import SCENES as TOFMARK_SCENES
 from dsr.data.tofmark import ToFMark
@@ -37,6 +35,9 @@ def stereo_2014(root, names):
 def node(name):
     """Return a data set's configuration, with environment variables left alone."""
     return yaml.safe_load((CONF / f"{name}.yaml").read_text())
+
+
+ICL_FRAMES, SUN_FRAMES = (node(name)["frames"] for name in ("icl", "sunrgbd"))
 
 
 def test_evaluation_set_has_34_images_and_icl_and_middlebury_have_rows_in_the_paper_tables():
@@ -76,10 +77,10 @@ def test_sun_rgbd_scenes_are_found_below_any_folder_by_path_or_prefix(tmp_path):
     root = touch(tmp_path, *(f"SUNRGBD/{path}/{part}/x" for path in paths for part in ("image", "depth")),
                  "SUNRGBD/xtion/sun3ddata/brown_bm_2/brown_bm_2/a/image/x",
                  "SUNRGBD/xtion/sun3ddata/brown_bm_2/brown_bm_2/a/depth/x")  # fmt: skip
-    data = SunRGBD(root)
+    data = SunRGBD(root, frames=SUN_FRAMES)
     assert data.scenes() == list(SUN_FRAMES)
     assert "brown_bm_2_a" in data._found["xtion_3"].files[0].as_posix().replace("/", "_")
-    assert len(SunRGBD(root, "found").scenes()) == 14
+    assert len(SunRGBD(root, "found", frames=SUN_FRAMES).scenes()) == 14
 
 
 def test_middlebury_has_the_scenes_of_the_paper_and_none_of_them_is_trained_on(tmp_path):

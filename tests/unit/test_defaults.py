@@ -1,7 +1,6 @@
 """A setting has one default: the value in ``conf`` is the one that the class or function has."""
 
 import inspect
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -44,11 +43,8 @@ MIXTURES = {"dataset/mixture", "dataset/paper_train"}  # parts, each a data set'
 
 def defaults_of(target):
     parameters = inspect.signature(target).parameters.values()
-    return {each.name: plain(each.default) for each in parameters if each.default is not each.empty}
-
-
-def plain(value):
-    return list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
+    found = {each.name: each.default for each in parameters if each.default is not each.empty}
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}
 
 
 def differences(values, defaults):

@@ -64,9 +64,7 @@ def _sample(size=48):
 
 
 def _on(sample, device):
-    assert sample.depth is not None
-    maps = {name: getattr(sample, name).to(device) for name in ("rgb", "depth_lr", "depth")}
-    return replace(sample, **maps)
+    return replace(sample, **{name: getattr(sample, name).to(device) for name in ("rgb", "depth_lr", "depth")})
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -280,6 +278,12 @@ def test_tf32_is_for_those_who_ask_for_it_and_not_for_losses():
 def test_what_a_device_cannot_compute_is_refused(name, precision, error):
     with pytest.raises(ConfigError, match=f"^{error}"):
         pick_device(name, precision=precision)
+
+
+@pytest.mark.parametrize("name", ["gpu", "cuda:99", "meta", "", "cpu:x"])
+def test_device_that_this_machine_lacks_is_refused(name):
+    with pytest.raises(ConfigError, match=r"^device: expected auto, cpu or a device of this machine, got "):
+        pick_device(name)
 
 
 @pytest.mark.parametrize(

@@ -9,12 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from dsr.degradation.downsampling import (
-    Downsampling,
-    Kernel,
-    Measured,
-    make_sample,
-)
+from dsr.degradation.downsampling import Downsampling, Kernel, Measured, make_sample
 from dsr.degradation.noise import GaussianMultiplicative
 from dsr.geometry.camera import RANGE_TYPES, Camera, to_range
 from dsr.sample import Scene
@@ -139,10 +134,6 @@ def test_size_that_the_scale_does_not_divide_is_refused():
         BOX(_values(8, 10), 4)
 
 
-def _points(depth, camera):
-    return depth * camera.rays()
-
-
 @pytest.mark.parametrize("camera", [CAMERA, STEREO])
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_low_resolution_camera_has_the_points_of_a_tilted_plane(kernel, camera):
@@ -152,7 +143,7 @@ def test_low_resolution_camera_has_the_points_of_a_tilted_plane(kernel, camera):
     inside = (slice(None), slice(None)) if narrow else (slice(2, -2), slice(2, -2))
     for scale in SCALES if narrow else (2, 4):
         sample = make_sample(_scene(tilted, camera), scale, Downsampling(kernel), "disparity")
-        offset = (normal * _points(sample.depth_lr, sample.camera_lr)).sum(dim=0)
+        offset = (normal * sample.depth_lr * sample.camera_lr.rays()).sum(dim=0)
         torch.testing.assert_close(offset[inside], torch.full_like(offset[inside], -2.0), rtol=1e-12, atol=0)
 
 
@@ -205,7 +196,8 @@ def test_bicubic_undershoot_below_zero_is_a_hole(range_type):
 def test_measured_map_is_used_unchanged(size, scale, ratio):
     measured = _values(*size)
     measured[0, 1, 1] = torch.nan
-    sample = make_sample(_scene(None, measured={ratio: measured}), scale, Measured(), "disparity")
+    noise = GaussianMultiplicative(0.1)  # a measured map has its own
+    sample = make_sample(_scene(None, measured={ratio: measured}), scale, Measured(), "disparity", noise)
     assert sample.depth_lr is measured
     assert sample.depth is None
     assert (sample.camera_lr, sample.scale) == (CAMERA.rescale(size[1], size[0]), ratio)
@@ -252,9 +244,6 @@ def test_measured_map_of_an_indivisible_size_is_that_of_the_cropped_photo():
     assert sample.camera == camera.crop(0, 0, 20, 20)
     assert sample.camera_lr == camera.crop(0, 0, 20, 20).rescale(5, 5)
     assert sample.notes == ("cropped from 21 x 23 to 20 x 20, which 4 divides",)
-
-
-# Noise
 
 
 def _wall(name="hall", dataset="set"):

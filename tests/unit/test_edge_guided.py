@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scipy import ndimage
-from small_scenes import disparity_of, grid, sample_of
+from small_scenes import disparity_of, grid, sample_of, seeded
 
 from dsr.methods.base import NoSolutionError
 from dsr.methods.classical.edge_guided import (
@@ -96,19 +96,6 @@ def test_map_too_small_for_patches_has_no_solution():
         EdgeGuided()(sample_of(_step(32, 0.0)[0]))
 
 
-def _field(nodes, pairs, labels=3, seed=0):
-    random = torch.Generator().manual_seed(seed)
-    unary = torch.rand(nodes, labels, generator=random, dtype=torch.float64)
-    costs = torch.rand(len(pairs), labels, labels, generator=random, dtype=torch.float64)
-    return unary, torch.tensor(pairs, dtype=torch.long).view(-1, 2), costs
-
-
-def _least(unary, pairs, costs):
-    nodes, labels = unary.shape
-    every = itertools.product(range(labels), repeat=nodes)
-    return min(energy(torch.tensor(each), unary, pairs, costs) for each in every)
-
-
 def _patches(count, seed=0):
     random = np.random.default_rng(seed)
     return torch.from_numpy(random.random((count, PATCH, PATCH)) < 0.1)
@@ -116,10 +103,12 @@ def _patches(count, seed=0):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_belief_propagation_finds_the_minimum_on_a_tree(seed):
-    field = _field(6, [(0, 1), (1, 2), (3, 1), (3, 4), (5, 3)], seed=seed)
+    unary, costs = (torch.rand(shape, generator=seeded(seed)).double() for shape in ((6, 3), (5, 3, 3)))
+    field = unary, torch.tensor([(0, 1), (1, 2), (3, 1), (3, 4), (5, 3)]), costs
     labels, history = label(*field)
     assert history[-1]["moved"] <= 1e-3
-    assert energy(labels, *field) == pytest.approx(_least(*field), abs=1e-12)
+    least = min(energy(torch.tensor(each), *field) for each in itertools.product(range(3), repeat=6))
+    assert energy(labels, *field) == pytest.approx(least, abs=1e-12)
 
 
 def test_distances_equal_scipy_and_overlaps_equal_a_loop():

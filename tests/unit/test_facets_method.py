@@ -174,18 +174,6 @@ def test_some_maps_without_noise_have_weights_of_their_own(tmp_path):
         AnyMap(common, kernel="bicubic", edges="soft", clean=True)
 
 
-def test_dubious_pixels_may_be_left_as_holes():
-    torch.manual_seed(0)
-    net, sample = FacetsUNet(2, 8, 8, 4).eval(), _sample((24, 32), 2, 0.01 * torch.randn(24, 32))
-    whole = AnyMap(net).surface(sample)
-    share = whole.depth_error / whole.depth
-    limit = float(share.median())
-    cut = AnyMap(net, max_error=limit).surface(sample)
-    assert torch.equal(cut.depth.isnan(), share > limit)
-    kept = cut.depth.isfinite()
-    assert torch.equal(cut.depth[kept], whole.depth[kept])
-
-
 def test_flat_parts_of_rounded_maps_are_at_best_as_sure_as_the_rounding():
     rows, columns = 24, 32
     steps = torch.tensor([0.50, 0.52, 0.545, 0.57]).double()

@@ -1,11 +1,8 @@
 """Clear, mirroring and glossy objects: how they are made, what sensors see of them, and what finds them."""
 
-import importlib.util
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
-import safetensors.torch
 import torch
 from small_scenes import seeded
 
@@ -15,7 +12,7 @@ from dsr.degradation.noise import NOISES
 from dsr.degradation.random_degradation import SENSOR_NOISES, Everything
 from dsr.geometry.camera import Camera
 from dsr.inference import upsample_surface
-from dsr.methods.glass import FEATURES, GlassFinder, expect_glass, glass_features, probability_of_glass
+from dsr.methods.glass import FEATURES, expect_glass, glass_features, probability_of_glass
 from dsr.metrics.calibration import off_auc
 from dsr.sample import AllHolesError, Scene
 
@@ -67,11 +64,8 @@ def test_holes_of_the_truth_are_no_depth_to_a_sensor(kind):
 def test_a_ball_is_round():
     pose = Pose(48, 80, (0, -1), 0.4, -0.4, 2)
     body = ball(pose, 30, (SIZE, SIZE))
-    v, u = torch.meshgrid(
-        torch.arange(body.rows.start, body.rows.stop),
-        torch.arange(body.columns.start, body.columns.stop),
-        indexing="ij",
-    )
+    v, u = (torch.arange(each.start, each.stop) for each in (body.rows, body.columns))
+    v, u = torch.meshgrid(v, u, indexing="ij")
     right, down = u - 48.0, v - 50.0
     away = (right.square() + down.square()).sqrt()
     assert torch.equal(body.mask[away < 29], torch.ones_like(body.mask[away < 29]))
@@ -133,19 +127,9 @@ def test_maps_show_what_sensors_see_and_hints_on_noise_leave_it_out():
     assert beyond > 200
 
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "train_glass.py"
-
-
-def _random(height, width, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    rgb = torch.rand(3, height, width, generator=generator)
-    inverse = 0.5 + 0.01 * torch.randn(1, height // 2, width // 2, generator=generator)
-    inverse[0, 10:14, 12:20] = torch.nan
-    return rgb, inverse
-
-
 def test_features_do_not_depend_on_the_unit_of_depth():
-    rgb, inverse = _random(120, 160)
+    rgb, inverse = torch.rand(3, 120, 160, generator=seeded()), 0.5 + 0.01 * torch.randn(1, 60, 80, generator=seeded())
+    inverse[0, 10:14, 12:20] = torch.nan
     found = glass_features(rgb, inverse)
     assert found.shape == (FEATURES, 240, 320)
     assert bool(found.isfinite().all())
@@ -223,14 +207,9 @@ def test_wrong_depth_of_simulated_vessels_is_ranked_first_and_expected_to_be_wro
     assert sum(aucs) / len(aucs) > 0.8
 
 
-def test_stated_errors_of_all_methods_know_glass_unless_the_map_is_told_to_be_clean(
-    monkeypatch,
-):
-    rgb, depth, camera = (
-        torch.full((3, 48, 64), 0.5),
-        torch.full((1, 48, 64), 2.0),
-        Camera.from_fov(60, width=64, height=48),
-    )
+def test_stated_errors_of_all_methods_know_glass_unless_the_map_is_told_to_be_clean(monkeypatch):
+    rgb, depth = torch.full((3, 48, 64), 0.5), torch.full((1, 48, 64), 2.0)
+    camera = Camera.from_fov(60, width=64, height=48)
     glass = torch.zeros(1, 48, 64)
     glass[:, :24] = 0.06
     monkeypatch.setattr("dsr.inference.any_ratio.expect_glass", lambda *_: glass)
@@ -242,19 +221,3 @@ def test_stated_errors_of_all_methods_know_glass_unless_the_map_is_told_to_be_cl
     clean = upsample_surface(rgb, depth, camera, settings={"noise": 0.0}, device="cpu")
     assert float(clean.depth_error.max()) < 0.06
     assert clean.glass is None
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")  # Lightning's
-def test_training_script_writes_weights_that_fit(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    spec = importlib.util.spec_from_file_location("train_glass", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    small = ["--scenes", "2", "--rendered", "1", "--steps", "2", "--workers", "0", "-o", "glass.safetensors"]
-    monkeypatch.setattr("sys.argv", ["train_glass.py", *small])
-    module.main()
-    state = safetensors.torch.load_file("glass.safetensors")
-    GlassFinder().load_state_dict(state)
-    assert all(bool(each.isfinite().all()) for each in state.values())
-    assert float(state["scale"].min()) > 0

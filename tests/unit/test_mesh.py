@@ -8,6 +8,7 @@ import pytest
 import torch
 import trimesh
 from scipy.spatial.transform import Rotation
+from small_scenes import grid, sphere_depth
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import fuse_maps, project, select_points, simplify, thin, triangulate, vertex_normals
@@ -21,22 +22,10 @@ def wall(z=2.0, camera=CAMERA):
     return torch.full((1, camera.height, camera.width), float(z))
 
 
-def floor(camera, below=1.5):
-    """Return the depth of the plane y = below, of which the camera sees rows under its horizon alone."""
-    rows = torch.arange(camera.height, dtype=torch.float64) - camera.cy
-    return (below * camera.fy / torch.where(rows > 0, rows, torch.nan))[None, :, None].expand(1, -1, camera.width)
-
-
 def sphere(camera, distance=3.0, radius=1.0):
     """Return the depth of a sphere on the optical axis, NaN around it."""
-    rays = camera.rays()
-    a, b = rays.square().sum(dim=0), distance
-    root = b * b - a * (distance**2 - radius**2)
-    return ((b - torch.where(root >= 0, root, torch.nan).sqrt()) / a)[None]
-
-
-def squares(camera=CAMERA):
-    return (camera.width - 1) * (camera.height - 1)
+    depth = sphere_depth(camera.rays(), (0, 0, distance), radius)[None]
+    return depth.masked_fill(depth.isinf(), torch.nan)
 
 
 def face_normals(mesh):
@@ -44,7 +33,7 @@ def face_normals(mesh):
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), corners.mean(axis=1)
 
 
-def spans(mesh, depth):
+def spans(mesh):
     """Return the largest relative range of depth within a face."""
     z = mesh.vertices[mesh.faces][..., 2]
     return (z.max(axis=1) / z.min(axis=1)).max() - 1
@@ -53,7 +42,7 @@ def spans(mesh, depth):
 def test_wall_mesh_has_two_triangles_per_square_and_the_area_of_the_wall():
     mesh = triangulate(wall(), CAMERA)
     assert len(mesh.vertices) == 40 * 30
-    assert len(mesh.faces) == 2 * squares()
+    assert len(mesh.faces) == 2 * 39 * 29
     assert mesh.faces.dtype == np.int32
     areas = np.linalg.norm(face_normals(mesh)[0], axis=1) / 2
     assert areas.sum() == pytest.approx(39 * 29 * (2 / 50) ** 2)
@@ -71,7 +60,8 @@ def test_faces_and_vertex_normals_face_the_camera(seed):
 
 def test_floor_stays_whole_up_to_the_row_below_the_horizon():
     camera = Camera(20, 120, 400, 400, 9.5, 14.5)
-    depth = floor(camera)
+    rows = torch.arange(120, dtype=torch.float64) - camera.cy
+    depth = (1.5 * camera.fy / torch.where(rows > 0, rows, torch.nan))[None, :, None].expand(1, -1, 20)
     assert float(depth[0, 15, 0] / depth[0, 16, 0]) == pytest.approx(3)  # the change that must not be cut
     mesh = triangulate(depth, camera)
     assert len(mesh.faces) == 2 * 19 * (120 - 15 - 1)
@@ -101,7 +91,7 @@ def test_step_of_three_percent_is_cut_and_one_of_one_percent_is_not(step, cut, t
     depth[0, :, 15:] *= step
     mesh = triangulate(depth.mT if transposed else depth, camera)
     assert len(mesh.faces) == 2 * 29 * (28 if cut else 29)
-    assert (spans(mesh, depth) < 1e-6) == cut
+    assert (spans(mesh) < 1e-6) == cut
 
 
 def test_step_smeared_over_three_pixels_and_a_pole_of_one_leave_no_connecting_faces():
@@ -109,7 +99,7 @@ def test_step_smeared_over_three_pixels_and_a_pole_of_one_leave_no_connecting_fa
     smeared[0, :, 18:20] = torch.tensor([2.35, 2.7])
     smeared[0, :, 20:], pole[0, :, 20] = 3, 1.5
     mesh = triangulate(smeared, CAMERA)
-    assert spans(mesh, smeared) < 1e-6
+    assert spans(mesh) < 1e-6
     assert set(np.unique(mesh.vertices[:, 2])) == {2.0, 3.0}
     mesh = triangulate(pole, CAMERA)
     assert (mesh.vertices[:, 2] == 2).all()
@@ -166,19 +156,15 @@ HEIGHT, WIDTH = 150, 210
 OTHER = Camera(WIDTH, HEIGHT, 200.0, 200.0, 104.5, 74.5)
 
 
-def grid():
-    return torch.meshgrid(torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij")
-
-
 def plane():
     """A wall that recedes to the right."""
-    _, x = grid()
+    _, x = grid(HEIGHT, WIDTH)
     return (1 / (0.5 - 0.001 * (x - 104.5)))[None]
 
 
 def ball():
     """A ball before the wall, with holes beside it."""
-    y, x = grid()
+    y, x = grid(HEIGHT, WIDTH)
     bump = (40**2 - (y - 70) ** 2 - (x - 90) ** 2).clamp(min=0).sqrt() / 100
     depth = torch.where(bump > 0, 1.5 - bump, plane()[0])
     depth[20:30, 150:155] = math.nan
@@ -217,24 +203,20 @@ def test_surface_keeps_its_steps_and_holes_without_cracks():
 
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-3])
 def test_pixels_lie_beside_the_mesh_by_little_more_than_allowed(tolerance):
-    depth = ball()
+    depth, full = ball(), ball().nan_to_num(9)
     mesh = triangulate(depth, OTHER, tolerance=tolerance * depth)
-    y, x = (each[depth[0].isfinite()].numpy() for each in grid())
+    y, x = (each[depth[0].isfinite()].numpy() for each in grid(HEIGHT, WIDTH))
     rays = np.stack(((x - OTHER.cx) / OTHER.fx, (y - OTHER.cy) / OTHER.fy, np.ones(len(x))), axis=1)
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     places, ray, _ = shape.ray.intersects_location(np.zeros_like(rays), rays, multiple_hits=False)
     assert len(ray) > 0.95 * len(rays)
     true = depth[0].numpy()[y.astype(int), x.astype(int)][ray]
-    off = np.abs(places[:, 2] / true - 1)[rays_inside(depth, y, x)[ray]]
+    # at an outline a ray may pass beside a side of a triangle
+    far, near = (torch.nn.functional.max_pool2d(each[None], 5, 1, 2)[0, 0] for each in (full, -full))
+    inside = ((far + near) < 0.1)[y.astype(int), x.astype(int)].numpy()
+    off = np.abs(places[:, 2] / true - 1)[inside[ray]]
     assert np.quantile(off, 0.99) < 1.2 * tolerance
     assert off.max() < 3 * tolerance
-
-
-def rays_inside(depth, y, x):
-    """Return which pixels are not at an outline, where a ray may pass beside a side of a triangle."""
-    near = torch.nn.functional.max_pool2d(depth.nan_to_num(9)[None], 5, 1, 2)[0, 0]
-    far = -torch.nn.functional.max_pool2d(-depth.nan_to_num(9)[None], 5, 1, 2)[0, 0]
-    return ((near - far) < 0.1)[y.astype(int), x.astype(int)].numpy()
 
 
 def test_pixels_without_tolerance_are_all_kept():
@@ -253,7 +235,7 @@ TRIANGLES = 2 * 29 * 39
 
 
 def wavy():
-    rows, columns = torch.meshgrid(torch.arange(30.0), torch.arange(40.0), indexing="ij")
+    rows, columns = grid(30, 40)
     return (2 + 0.05 * torch.sin(rows / 5) * torch.cos(columns / 6))[None]
 
 
@@ -322,11 +304,7 @@ def seen(turn):
     turned = Rotation.from_euler("y", turn, degrees=True).as_matrix()
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turned, CENTRE - turned @ np.array([0, 0, 2.0])
-    rays = TURNING.rays().numpy()
-    half, square = 2.0 * rays[2], (rays**2).sum(0)
-    root = half**2 - square * (4.0 - RADIUS**2)
-    depth = np.where(root > 0, (half - np.sqrt(np.maximum(root, 0))) / square, np.nan)
-    return PosedMap(depth, TURNING, pose)
+    return PosedMap(sphere(TURNING, 2.0, RADIUS)[0].numpy(), TURNING, pose)
 
 
 def test_fused_mesh_lies_on_the_sphere_and_faces_outward():

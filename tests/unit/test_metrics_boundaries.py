@@ -1,4 +1,4 @@
-"""Boundary F1, boundary errors and planes: the values of their authors' code, closed forms, holes."""
+"""Edges, planes, points and relative depth, by their authors' codes and against all pairs; what holes do to them."""
 
 import math
 
@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 from depth_steps import CAMERA, UNKNOWN, holed, pair_of, steps
+from scipy.spatial.distance import cdist
 
 from dsr.geometry.camera import Camera
-from dsr.metrics import boundaries
-from dsr.metrics.catalogue import catalogue
+from dsr.metrics import boundaries, evalmde
+from dsr.metrics.catalogue import catalogue, score_image
 
 METRICS = tuple(each for each in catalogue(protocols=("boundaries",)) if each.region is None)
 
@@ -122,3 +123,172 @@ def test_holes_of_a_prediction_miss_the_edges_there_and_are_reported():
     assert part["DBE_completeness"] > full["DBE_completeness"] == 0
     assert part["DepthPro_ceiling"] == full["DepthPro_ceiling"]
     assert part["Boundary_covered"] == pytest.approx(1 - 30 * 60 / truth.size)
+
+
+EVALMDE = catalogue(protocols=("evalmde",))
+
+
+def _evalmde(pair):
+    return {metric.name.removeprefix("EvalMDE_"): metric.function(pair).item() for metric in EVALMDE}
+
+
+def test_scores_of_their_example_are_those_of_their_code(shared):
+    folder = shared / "expected" / "evalmde"
+    stored, prediction = (np.load(folder / name) for name in ("gt_depth.npz", "depthpro_gt_focal.npz"))
+    truth = np.where(stored["valid"], stored["depth"], np.nan)
+    camera = Camera(truth.shape[1], truth.shape[0], *map(float, stored["intr"]))
+    found = _evalmde(pair_of(prediction["depth"], truth, camera))
+    assert found["RelNormal"] == pytest.approx(0.3900358, abs=2e-6)
+    assert 1 - found["WKDR"] == pytest.approx(0.935941, abs=1e-6)
+    assert 1 - found["beyond_disparity"] == pytest.approx(0.0821814, abs=1e-6)
+    assert 1 - found["beyond_depth"] == pytest.approx(0.0192955, abs=1e-6)
+    assert 1 - found["boundary"] == pytest.approx(0.4865937, abs=1e-6)
+    assert found["SAWA_H"] == pytest.approx(1.26818, abs=5e-6)
+    assert found["SAWA_H"] == pytest.approx(1.2682612, abs=1e-3)  # of one draw of their random pairs
+
+
+def test_scores_of_a_map_with_unknown_truth_are_those_of_their_code():
+    """Executed: princeton-vl/EvalMDE ea9e21c, with the truth's mask; WKDR by its formula for all pairs."""
+    found = _evalmde(pair_of(*holed()))
+    expected = {
+        "RelNormal": 0.2733864,
+        "WKDR": 0.0234771497,
+        "beyond_disparity": 0.0446922,
+        "beyond_depth": 0.0447452,
+        "boundary": 0.0589925013,
+        "covered": 1,
+    }
+    weights = {"WKDR": 3.65, "beyond_disparity": 0.18, "beyond_depth": 0.01, "boundary": 0.2, "RelNormal": 1.94}
+    expected["SAWA_H"] = sum(weight * expected[name] for name, weight in weights.items())
+    assert found == pytest.approx(expected, abs=5e-6)
+
+
+def test_missing_normals_are_errors_of_pi_as_in_their_code():
+    prediction, truth = holed()
+    prediction[20:30, 90:120] = np.nan
+    assert evalmde.rel_normal(pair_of(prediction, truth)).item() == pytest.approx(0.4731059, abs=5e-6)
+
+
+def test_no_part_gains_by_leaving_pixels_out():
+    prediction, truth = steps()
+    full = _evalmde(pair_of(prediction, truth))
+    prediction[30:60, 30:90] = np.nan
+    part = _evalmde(pair_of(prediction, truth))
+    assert all(part[name] > value for name, value in full.items() if name != "covered")
+    assert part["covered"] == pytest.approx(1 - 30 * 60 / truth.size)
+
+
+def test_affine_maps_of_depth_and_of_disparity_are_fitted():
+    _, truth = steps()
+    truth = 3 * truth.astype(float) - 5
+    of_depth, of_disparity = pair_of(0.3 * truth + 0.7, truth), pair_of(1 / (0.4 / truth + 0.1), truth)
+    depth, disparity = _evalmde(of_depth), _evalmde(of_disparity)
+    assert depth["beyond_depth"] == disparity["beyond_disparity"] == 0
+    assert depth["beyond_disparity"] > 0
+    assert disparity["beyond_depth"] > 0
+
+
+@pytest.mark.parametrize("ties", [False, True])
+def test_order_of_pairs_is_counted_one_by_one(ties):
+    random = np.random.default_rng(0)
+    prediction, truth = 1 + random.random((2, 18, 20))
+    if ties:
+        prediction, truth = prediction.round(1), truth.round(1)
+    prediction[2, :5], truth[5:7, 3] = np.nan, np.nan
+    known = np.isfinite(truth)
+    p, t = prediction[known].astype("f"), truth[known].astype("f")
+    wrong = ((p[:, None] < p) != (t[:, None] < t)) | np.isnan(p[:, None]) | np.isnan(p)
+    found = evalmde.wkdr(pair_of(prediction, truth, CAMERA.crop(0, 0, 18, 20)))
+    assert found.item() == pytest.approx(wrong.mean(), rel=1e-12)
+
+
+def test_prediction_of_holes_alone_has_the_largest_errors():
+    prediction, truth = steps()
+    found = _evalmde(pair_of(np.full_like(prediction, np.nan), truth))
+    assert found.pop("SAWA_H") == pytest.approx(3.65 + 0.18 + 0.01 + 0.2 + 1.94 * math.pi)
+    assert found == {
+        **dict.fromkeys(("WKDR", "beyond_disparity", "beyond_depth", "boundary"), 1),
+        "RelNormal": pytest.approx(math.pi),
+        "covered": 0,
+    }
+
+
+NARROW = Camera(width=48, height=40, fx=60.0, fy=60.0, cx=23.5, cy=19.5)
+RAYS = NARROW.rays()[None]
+V, U = np.mgrid[:40, :48].astype(float)
+STEP = np.where(U < 24, 1.0, 2.0)
+POINTS = catalogue(protocols=("points",))
+
+
+def _points(prediction, truth):
+    maps = (torch.as_tensor(each, dtype=torch.float64)[None] for each in (prediction, truth))
+    return {row.metric: row.value for row in score_image(*maps, RAYS[0], POINTS)}
+
+
+def _pierced(seed):
+    """Return a prediction with errors from millimetres to decimetres, and a truth with a step; both have holes."""
+    phase = np.sin(0.9 * U + 1.7 * V + seed)
+    truth = STEP + 0.1 * np.sin(0.3 * V)
+    prediction = truth * (1 + 0.02 * phase**3) + np.where(np.abs(U - 24) < 3, 0.4, 0)
+    prediction[5:9, 3:9], truth[20:24, 30:33] = np.nan, np.nan
+    return prediction, truth
+
+
+def _naive(prediction, truth):
+    rays = RAYS[0].permute(1, 2, 0).numpy()
+    true, both = np.isfinite(truth), np.isfinite(truth) & np.isfinite(prediction)
+    apart = cdist((prediction[..., None] * rays)[both], (truth[..., None] * rays)[true])
+    there, back = apart.min(axis=1), apart.min(axis=0)
+    apart_map = np.zeros(truth.shape)
+    apart_map[both] = there
+    edges = [  # row, column, front, back
+        (*place, *sorted(depths))
+        for v, u in np.ndindex(truth.shape)
+        for v2, u2 in ((v, u + 1), (v + 1, u))
+        if v2 < 40 and u2 < 48 and max(depths := (truth[v, u], truth[v2, u2])) / min(depths) > 1.05
+        for place in ((v, u), (v2, u2))
+    ]
+    row, column, front, back_side = np.array(edges).T
+    fly = 0
+    for v, u in np.argwhere(both):
+        near = np.maximum(abs(row - v), abs(column - u)) <= 16
+        z = prediction[v, u]
+        fly += near.any() and front[near].min() < z < back_side[near].max() and apart_map[v, u] > 0.01 * z
+    f = {}
+    for limit in (1, 5):
+        precision, recall = (there < limit / 100).mean(), (back < limit / 100).mean()
+        f[f"Points_F_{limit}cm"] = 2 * precision * recall / (precision + recall)
+    return {
+        "Points_flying": fly / both.sum(),
+        "Points_chamfer": (there.mean() + back.mean()) / 2,
+        **f,
+        "Points_covered": both.sum() / true.sum(),
+    }
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_scores_are_those_of_all_pairs_of_points(seed):
+    prediction, truth = _pierced(seed)
+    found = _points(prediction, truth)
+    assert found == pytest.approx(_naive(prediction, truth), rel=1e-10)
+    assert 0 < found["Points_flying"] < 0.3
+    assert 0.1 < found["Points_F_1cm"] < found["Points_F_5cm"] < 1
+
+
+def test_only_points_in_the_void_between_surfaces_fly():
+    between = np.where(U == 24, 1.5, STEP)  # a column in the middle of the step
+    assert _points(between, STEP)["Points_flying"] == pytest.approx(1 / 48)
+    assert _points(np.where(np.abs(U - 24) < 4, np.where(U < 24, 2, 1), STEP), STEP)["Points_flying"] == 0  # moved edge
+    assert _points(np.where(U == 24, 2.5, STEP), STEP)["Points_flying"] == 0  # behind both
+    assert _points(np.where(U == 24, 0.5, STEP), STEP)["Points_flying"] == 0  # before both
+    assert _points(np.where(U == 45, 1.5, STEP), STEP)["Points_flying"] == 0  # far from the edge
+    assert _points(np.where(U == 24, 1.04, STEP), np.where(U < 24, 1.0, 1.045))["Points_flying"] == 0  # no edge
+
+
+def test_hole_does_not_win():
+    prediction = np.where(U == 24, 1.5, STEP)
+    without = np.where(np.abs(U - 24) < 4, np.nan, STEP)
+    found, holed = _points(prediction, STEP), _points(without, STEP)
+    assert holed["Points_flying"] == 0
+    assert holed["Points_covered"] == pytest.approx(41 / 48)
+    assert holed["Points_F_1cm"] < found["Points_F_1cm"]

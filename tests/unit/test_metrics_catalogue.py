@@ -175,18 +175,6 @@ def _half_planes():
     return 1 / (0.5 + 0.002 * (u - CAMERA.cx))[None], (1 + (v >= 20))[None].to(torch.uint8), u.remainder(2) - 0.5
 
 
-def test_planes_of_a_region_have_a_planarity_error():
-    metrics = catalogue(protocols=["boundaries"])
-    target, planes, wave = _half_planes()
-    for prediction, flat in ((2 * target, True), (target * (1 + 0.01 * wave), False)):
-        rows = score_image(prediction, target, CAMERA.rays(), metrics, regions={"planes": planes})
-        error = {row.metric: row.value for row in rows}
-        assert (error["PE_flatness"] < 1e-6) == flat
-        assert (error["PE_orientation"] < 1e-3) or not flat
-    rows = score_image(target, target, CAMERA.rays(), metrics)
-    assert not any(row.metric.startswith("PE_") for row in rows)
-
-
 def test_holes_neither_hide_a_bad_plane_nor_a_bad_region():
     target, planes, wave = _half_planes()
     prediction = target * (1 + 0.02 * (planes == 2) * wave)

@@ -3,10 +3,10 @@
 import pytest
 import torch
 from small_networks import with_any_weights
-from small_scenes import maps, photos, plane_map
+from small_scenes import maps, photos, plane_map, problem
 from torch.nn import functional
 
-from dsr.geometry.camera import Camera, from_range, to_range
+from dsr.geometry.camera import to_range
 from dsr.methods.images import compute_min_max
 from dsr.methods.networks.ddrnet import DDRNet
 from dsr.methods.networks.dynamic_guidance import DynamicGuidance
@@ -23,7 +23,6 @@ from dsr.methods.networks.network import (
 )
 from dsr.methods.networks.pdn import PrimalDualNetwork
 from dsr.methods.networks.sparse_to_dense import SparseToDense
-from dsr.sample import DepthSample
 
 BUILDERS = {
     "facets": lambda scale: Facets(scale, width=8, blocks=1),
@@ -146,21 +145,6 @@ def _method(name, *, ensemble=1):
     return NetworkUpsampler(net.double(), ensemble=ensemble)
 
 
-def _pair(scale, height, width):
-    generator = torch.Generator().manual_seed(3)
-    rgb = torch.rand((1, 3, scale * height, scale * width), generator=generator)
-    coarse = 20 + 5 * torch.rand((1, 1, height, width), generator=generator)
-    return rgb, coarse
-
-
-def _sample(scale, height, width):
-    rgb, coarse = _pair(scale, height, width)
-    camera = Camera(scale * width, scale * height, 600.0, 600.0, 3.0, 4.0, baseline=0.2)
-    low = camera.rescale(width, height)
-    depth = from_range(coarse[0].double() / scale, low, "disparity")
-    return DepthSample("test", "scene", rgb[0], depth, camera, low, scale)
-
-
 @pytest.mark.parametrize(("size", "tile", "overlap"), [(100, 30, 4), (31, 30, 4), (30, 30, 4), (7, 1, 2), (1, 5, 0)])
 def test_tile_weights_add_up_to_one_everywhere(size, tile, overlap):
     total = torch.zeros(2 * size)
@@ -183,7 +167,7 @@ def test_results_that_differ_by_a_constant_are_joined_by_a_ramp():
 def test_tiled_result_equals_the_whole_image(name, ensemble):
     method, steps = _method(name, ensemble=ensemble), []
     scale = method.net.scale
-    rgb, coarse = _pair(scale, 14, 48)
+    rgb, coarse = photos(14 * scale, 48 * scale), maps(14, 48)
     coarse[..., 3:9, 4:20] = torch.nan  # a hole that is larger than a tile
     if method.net.arguments().get("variant") in ("voynov", "hui"):
         coarse = coarse.nan_to_num(nan=20.5)  # random networks turn the step at a hole into anything
@@ -199,7 +183,7 @@ def test_tiled_result_equals_the_whole_image(name, ensemble):
 
 
 def test_large_photo_is_tiled_automatically(monkeypatch):
-    method, sample, parts = _method("facets"), _sample(4, 12, 12), []
+    method, sample, parts = _method("facets"), problem(4, 12, 12), []
     whole = method(sample, lambda done, total: parts.append(total))
     monkeypatch.setattr("dsr.methods.networks.network.UNTILED", 1000)
     monkeypatch.setattr("dsr.methods.networks.network.TILE", 24)
@@ -217,7 +201,7 @@ def test_dihedral_transforms_are_distinct_and_invertible(index):
 
 
 def test_augmentation_averages_what_depends_on_the_orientation():
-    sample = _sample(2, 6, 8)
+    sample = problem(2, 6, 8)
     plain = functional.interpolate(sample.disparity_lr()[None], scale_factor=2, mode="nearest")[0]
     down, right = (torch.linspace(-1, 1, n, dtype=torch.float64) for n in plain.shape[-2:])
     leaning = plain + right + down[:, None] ** 2

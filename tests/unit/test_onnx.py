@@ -184,26 +184,16 @@ def second(rgb, depth):
     return depth + 0 * rgb.mean()
 
 
-def nothing(rgb, depth):
-    return 0 * depth + 0 * rgb.mean()
-
-
-def enlarged(sample, quantity):
-    """Return the map of a quantity, enlarged by the kernel of the field's benchmarks."""
-    if quantity == "disparity":
-        return resize_bicubic(sample.disparity_lr()[None], (32, 48))
-    lr = {"orthogonal": sample.depth_lr, "inverse": 1 / sample.depth_lr}[quantity]
-    return resize_bicubic(lr[None], (32, 48))
-
-
 @pytest.mark.parametrize("quantity", ["disparity", "orthogonal", "inverse"])
 @pytest.mark.parametrize("value_range", ["measured", None, [0.0, 3.0]])
 @pytest.mark.parametrize("output", ["same", "residual"])
 def test_enlarged_map_returns_as_it_came(sample, tmp_path, quantity, value_range, output):
+    nothing = lambda rgb, depth: 0 * depth + 0 * rgb.mean()  # noqa: E731
     path = network(tmp_path, second if output == "same" else nothing, "rgb", "depth")
     inputs = {"rgb": "image", "depth": "up"}
     depth = NetworkFile(path, inputs, range_type=quantity, range=value_range, output=output)(sample)
-    expected = enlarged(sample, quantity)[0]
+    lr = {"disparity": sample.disparity_lr(), "orthogonal": sample.depth_lr, "inverse": 1 / sample.depth_lr}[quantity]
+    expected = resize_bicubic(lr[None], (32, 48))[0]  # by the kernel of the field's benchmarks
     got = {"disparity": to_range(depth, sample.camera, "disparity"), "orthogonal": depth, "inverse": 1 / depth}
     torch.testing.assert_close(got[quantity], expected, rtol=1e-4, atol=1e-5)
 
@@ -307,10 +297,8 @@ def test_content_follows_weights_that_lie_beside_the_graph(tmp_path):
 
 
 def test_network_that_returns_no_map_or_fails_is_named(sample, tmp_path):
-    inputs = {"rgb": "image", "depth": "up"}
-    path = network(tmp_path, lambda rgb, depth: depth[:, :, ::2] + 0 * rgb.mean(), "rgb", "depth")
-    with pytest.raises(ValueError, match=r"mine.onnx: expected"):
-        NetworkFile(path, inputs)(sample)
-    path = network(tmp_path, second, "rgb", "depth", size=(12, 16))
-    with pytest.raises(ValueError, match=r"mine.onnx: expected"):
-        NetworkFile(path, inputs)(sample)
+    narrow = lambda rgb, depth: depth[:, :, ::2] + 0 * rgb.mean()  # noqa: E731
+    for function, size in ((narrow, None), (second, (12, 16))):
+        path = network(tmp_path, function, "rgb", "depth", size=size)
+        with pytest.raises(ValueError, match=r"mine.onnx: expected"):
+            NetworkFile(path, {"rgb": "image", "depth": "up"})(sample)

@@ -468,12 +468,6 @@ def _waves():
     return Scene("set", "waves", rgb, WIDE, depth, {1: depth})
 
 
-def _quarter(vectors):
-    """Return vectors turned counterclockwise about the axis, as a picture with y down shows it."""
-    x, y, z = vectors
-    return torch.stack((y, -x, z))
-
-
 def _points(scene):
     return scene.depth * scene.camera.rays()
 
@@ -481,8 +475,8 @@ def _points(scene):
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
 def test_turned_scene_has_the_turned_points(turns):
     expected, scene = _points(_waves()).rot90(turns, (-2, -1)), rotate90(_waves(), turns)
-    for _ in range(turns):
-        expected = _quarter(expected)
+    for _ in range(turns):  # counterclockwise about the axis, as a picture with y down shows it
+        expected = torch.stack((expected[1], -expected[0], expected[2]))
     torch.testing.assert_close(_points(scene), expected, rtol=0, atol=1e-12, equal_nan=True)
     assert torch.equal(scene.rgb, _waves().rgb.rot90(turns, (-2, -1)))
     assert not turns or not scene.measured  # which would have to be turned, too

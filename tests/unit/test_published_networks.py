@@ -5,11 +5,10 @@ import pytest
 import torch
 from scipy import ndimage
 from small_networks import with_any_weights
-from small_scenes import maps, photos, plane_map
-from torch import Tensor, nn
+from small_scenes import maps, photos, plane_map, problem, seeded
+from torch import nn
 from torch.nn import functional
 
-from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.methods.images import (
     box_mean,
     compute_min_max,
@@ -20,36 +19,22 @@ from dsr.methods.images import (
     upsample_linear_border,
 )
 from dsr.methods.networks.ddrnet import DDRNet
-from dsr.methods.networks.dynamic_guidance import (
-    WIDTHS,
-    DynamicGuidance,
-    polynomial_filters,
-)
+from dsr.methods.networks.dynamic_guidance import WIDTHS, DynamicGuidance, polynomial_filters
 from dsr.methods.networks.msg_net import MSGNet, guidance_map
 from dsr.methods.networks.network import NetworkUpsampler
 from dsr.methods.networks.pdn import PrimalDualNetwork, UnrolledHuber, half_window
 from dsr.methods.networks.sparse_to_dense import BatchNorm, SparseToDense, UpProjection, place_samples
-from dsr.sample import DepthSample
 from dsr.utils.ratios import SCALES
 
 # PDN and dynamic guidance
 
 
-def _random(*shape, seed=0):
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def _problem(size, window, count=1):
+def _problem(size, window):
     """Return a map with steps, continued beyond the border, and weights whose pairs are partly across the steps."""
     r, n = window // 2, len(half_window(window))
-    first = _random(count, 1, size + 2 * r, size + 4 * r, seed=1) * 0.02
+    first = torch.rand(1, 1, size + 2 * r, size + 4 * r, generator=seeded(1)).double() * 0.02
     first[..., size // 2 :] += 0.5
-    return first, (_random(count, n, size, size, seed=2) + 0.01) / n
-
-
-def _pdn(scale=4, *, noise=0.05, window=3, **arguments):
-    sizes = {"width": 6, "layers": 3, "iterations": 3, **arguments}
-    return with_any_weights(lambda: PrimalDualNetwork(scale, window=window, **sizes), noise, scale)
+    return first, (torch.rand(1, n, size, size, generator=seeded(2)).double() + 0.01) / n
 
 
 def test_unrolled_stage_equals_a_plain_loop():
@@ -90,16 +75,20 @@ def _loop(f, w, steps, data, huber, window):
     return (u - f)[r : r + height, 2 * r : 2 * r + width]
 
 
-def test_gradients_of_maps_weights_and_parameters_agree_with_finite_differences():
-    window = 3
-    first, weights = _problem(4, window)
-    stage = UnrolledHuber(window, 2, 3.0, 0.5).double()
-    names, parameters = zip(*stage.named_parameters(), strict=True)
+def _gradients_are_those_of_differences(net, *maps, **tolerance):
+    """Check the gradients of a network's answer to maps in these, where they require some, and in its parameters."""
+    names, parameters = zip(*net.named_parameters(), strict=True)
 
-    def answer(first, weights, *values):
-        return torch.func.functional_call(stage, dict(zip(names, values, strict=True)), (first, weights))
+    def answer(*given):
+        values = dict(zip(names, given[len(maps) :], strict=True))
+        return torch.func.functional_call(net, values, given[: len(maps)])
 
-    assert torch.autograd.gradcheck(answer, [first.requires_grad_(), weights.requires_grad_(), *parameters])
+    return torch.autograd.gradcheck(answer, [*maps, *parameters], **tolerance)
+
+
+def test_gradients_of_a_stage_agree_with_finite_differences():
+    given = [each.requires_grad_() for each in _problem(4, 3)]
+    assert _gradients_are_those_of_differences(UnrolledHuber(3, 2, 3.0, 0.5).double(), *given)
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8, 16])
@@ -113,7 +102,8 @@ def test_untrained_pdn_reproduces_a_plane_up_to_the_border(scale):
 
 
 def test_convolutions_may_run_in_bfloat16():
-    net, rgb, coarse = _pdn(), photos(24, 28), maps(6, 7)
+    net = with_any_weights(lambda: PrimalDualNetwork(4, width=6, layers=3, window=3, iterations=3), 0.05, 4)
+    rgb, coarse = photos(24, 28), maps(6, 7)
     exact = net.upsample(rgb, coarse)
     with torch.autocast("cpu", torch.bfloat16):
         mixed = net.upsample(rgb, coarse)
@@ -123,12 +113,8 @@ def test_convolutions_may_run_in_bfloat16():
     assert float((halved - exact).abs().max()) < 0.05 * 9
 
 
-def _guided(scale=4, *, stages=2, filters=5, size=5, noise=0.2):
-    return with_any_weights(lambda: DynamicGuidance(scale, stages, filters, size), noise, scale)
-
-
-def _stage(*, filters=5, size=5):
-    return _guided(stages=1, filters=filters, size=size).double().stages[0]
+def _guided(scale=4, *, stages=2, filters=5, size=5):
+    return with_any_weights(lambda: DynamicGuidance(scale, stages, filters, size), 0.2, scale)
 
 
 @pytest.mark.parametrize("size", [3, 4, 7])
@@ -142,7 +128,7 @@ def test_filters_are_orthonormal_and_blind_to_what_the_first_ones_see(size):
 
 
 def test_stage_equals_plain_loops():
-    stage, rgb = _stage(filters=3), photos(16, 16).double()
+    stage, rgb = _guided(stages=1, filters=3).double().stages[0], photos(16, 16).double()
     coarse = maps(4, 4) / 30
     x = repeat_blocks(coarse, 4) + 0.1 * maps(16, 16)
     with torch.no_grad():
@@ -166,13 +152,8 @@ def test_stage_equals_plain_loops():
 
 def test_gradients_agree_with_finite_differences():
     net = _guided(2, filters=2, size=3).double().requires_grad_()
-    rgb, coarse = photos(8, 6).double(), maps(4, 3) / 30
-    names, parameters = zip(*net.named_parameters(), strict=True)
-
-    def answer(*values):
-        return torch.func.functional_call(net, dict(zip(names, values, strict=True)), (rgb, coarse))
-
-    assert torch.autograd.gradcheck(answer, parameters, eps=1e-7, atol=1e-4, fast_mode=True)
+    given = photos(8, 6).double(), maps(4, 3) / 30
+    assert _gradients_are_those_of_differences(net, *given, eps=1e-7, atol=1e-4, fast_mode=True)
 
 
 def test_mixed_precision_training_computes_in_float32():
@@ -183,7 +164,7 @@ def test_mixed_precision_training_computes_in_float32():
 
 
 def test_map_may_break_at_a_photo_edge_and_a_flat_photo_has_no_influence():
-    stage = _stage()
+    stage = _guided(stages=1).double().stages[0]
     edge = torch.zeros(1, 3, 16, 16, dtype=torch.float64)
     edge[..., 8:] = 1.0
     weights = stage.weights(edge)[0]
@@ -198,9 +179,9 @@ RESNET18 = 11_689_512 - 513_000 + 64 * 49
 """Parameters of ResNet-18 (He et al. 2016) without its classifier, with a fourth input channel."""
 
 
-def _sparse(scale=4, width=4):
+def _sparse(scale=4):
     torch.manual_seed(scale)
-    return SparseToDense(scale, width).eval()
+    return SparseToDense(scale, 4).eval()
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8, 16])
@@ -279,18 +260,14 @@ REFINEMENT = [(1, 8, 3), (1, 8, 3), (16, 16, 3), (32, 32, 3), (32, 32, 3), (64, 
               (112, 16, 1), (16, 4, 1), (4, 1, 1)]  # fmt: skip
 
 
-def _ddrnet(scale: int = 4) -> DDRNet:
-    return with_any_weights(lambda: DDRNet(scale, denoising=4, refinement=4), 0.3, scale)
-
-
-def _stages(net: DDRNet, rgb: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+def _stages(net, rgb, values):
     """Return the denoised and the refined map."""
     min_max = compute_min_max(values)
     answer = net.answer_patches({"rgb": rgb, "disparity_lr": values, "min_max": min_max})
     return answer.stages[0], answer.disparity
 
 
-def test_networks_have_the_parameters_of_the_published_code() -> None:
+def test_networks_have_the_parameters_of_the_published_code():
     net = DDRNet(4)
     for part, layers in ((net.denoise, DENOISING), (net.refine, REFINEMENT)):
         expected = sum(inputs * outputs * size**2 + outputs for inputs, outputs, size in layers)
@@ -298,7 +275,7 @@ def test_networks_have_the_parameters_of_the_published_code() -> None:
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8])
-def test_new_network_is_bicubic_upsampling(scale: int) -> None:
+def test_new_network_is_bicubic_upsampling(scale):
     torch.manual_seed(0)
     values, rgb = maps(5, 6), photos(5 * scale, 6 * scale)
     expected = upsample_linear_border(values, scale)
@@ -306,8 +283,8 @@ def test_new_network_is_bicubic_upsampling(scale: int) -> None:
         torch.testing.assert_close(stage, expected.float(), rtol=1e-6, atol=0)
 
 
-def test_refined_map_is_the_result_and_the_denoised_one_knows_no_photo() -> None:
-    net, values, rgb = _ddrnet(), maps(6, 7), photos(24, 28)
+def test_refined_map_is_the_result_and_the_denoised_one_knows_no_photo():
+    net, values, rgb = with_any_weights(lambda: DDRNet(4, 4, 4), 0.3, 4), maps(6, 7), photos(24, 28)
     denoised, refined = _stages(net, rgb, values)
     assert torch.equal(refined, net.upsample(rgb, values).float())
     others = _stages(net, 1 - rgb, values)
@@ -323,32 +300,11 @@ def _msg(scale, variant="voynov"):
     return MSGNet(scale, variant).eval()
 
 
-def _scene(scale, height, width, batch=1):
-    """Return a photo and a low-resolution disparity map, random but smooth enough to resemble one."""
-    generator = torch.Generator().manual_seed(height + width)
-    rgb = torch.rand((batch, 3, scale * height, scale * width), generator=generator)
-    disparity = 20 + 5 * torch.rand((batch, 1, height, width), generator=generator, dtype=torch.float64)
-    return rgb, disparity
-
-
-def _sample(scale, height, width, doffs=0.0):
-    rgb, disparity = _scene(scale, height, width)
-    camera = Camera(scale * width, scale * height, 600.0, 600.0, 3.0, 4.0, baseline=0.2, doffs=doffs)
-    coarse = camera.rescale(width, height)
-    depth = from_range(disparity[0] / scale, coarse, "disparity")
-    return DepthSample("test", "scene", rgb[0], depth, camera, coarse, scale)
-
-
-@pytest.mark.parametrize(("scale", "parameters"), [(4, 326_015), (8, 454_147)])
-def test_voynov_network_has_the_published_number_of_parameters(scale, parameters):
-    assert sum(value.numel() for value in MSGNet(scale).parameters()) == parameters
-
-
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("size", [(1, 3), (5, 4)])
 def test_voynov_network_covers_every_pixel_and_the_hui_network_all_but_the_last(scale, size):
-    rgb, disparity = _scene(scale, *size, batch=2)
     rows, columns = (scale * n for n in size)
+    rgb, disparity = photos(rows, columns, 2), maps(*size, 2)
     assert _msg(scale).upsample(rgb, disparity).shape == (2, 1, rows, columns)
     assert _msg(scale, "hui").upsample(rgb, disparity).shape == (2, 1, rows - 1, columns - 1)
 
@@ -370,8 +326,9 @@ def test_guidance_is_the_published_intensity_minus_its_mean(variant):
     ("scale", "height", "width"), [(2, 40, 90), (4, 64, 40), (4, 16, 33), (4, 32, 48), (8, 8, 8), (16, 20, 16)]
 )
 def test_drift_is_the_mean_of_the_output_for_a_probe_of_one_half(scale, height, width):
-    net, (rgb, disparity) = _msg(scale), _scene(scale, height, width, batch=2)
-    guidance, probe = guidance_map(rgb, net.variant), normalise(disparity).values
+    net = _msg(scale)
+    guidance = guidance_map(photos(scale * height, scale * width, 2), net.variant)
+    probe = normalise(maps(height, width, 2)).values
     with torch.inference_mode():
         drift = net.drift(guidance, probe)
         probe[..., : height // 4, : width // 4] = 0.5
@@ -384,37 +341,10 @@ def test_drift_is_the_mean_of_the_output_for_a_probe_of_one_half(scale, height, 
     assert net.drift(guidance[..., : 2 * scale, :], probe[..., :2, :]).count_nonzero() == 0  # of no rows
 
 
-@pytest.mark.parametrize("variant", ["hui", "voynov"])
-def test_bfloat16_stays_within_a_thousandth_of_the_range(variant):
-    sample, net = _sample(4, 32, 40), _msg(4, variant)
-    exact = to_range(NetworkUpsampler(net)(sample), sample.camera, "disparity")
-    rounded = to_range(NetworkUpsampler(net, "bfloat16")(sample), sample.camera, "disparity")
-    assert bool((exact.isnan() == rounded.isnan()).all())
-    difference = (exact - rounded).nan_to_num().abs() / 5
-    assert 0 < float(difference.max()) < 0.001  # 0.0002 measured
-
-
-@pytest.mark.parametrize("doffs", [0.0, 30.0])
-def test_plane_keeps_its_depth_with_and_without_a_disparity_offset(doffs):
-    sample = _sample(4, 8, 8, doffs)
-    flat = DepthSample("test", "flat", sample.rgb, torch.full((1, 8, 8), 2.5), sample.camera, sample.camera_lr, 4)
-    depth = NetworkUpsampler(_msg(4))(flat)
-    assert depth.shape == (1, 32, 32)
-    torch.testing.assert_close(depth, torch.full_like(depth, 2.5))
-
-
-def test_hui_method_leaves_its_last_row_and_column_missing():
-    depth = NetworkUpsampler(_msg(4, "hui"))(_sample(4, 8, 9))
-    assert depth.shape == (1, 32, 36)
-    assert bool(depth[0, -1].isnan().all())
-    assert bool(depth[0, :, -1].isnan().all())
-    assert bool(depth[0, :-1, :-1].isfinite().all())
-
-
 def test_disparity_that_is_not_positive_becomes_a_hole():
     net = _msg(4, "hui")
     torch.nn.init.constant_(net.get_parameter("reconstruct.conv.bias"), -100.0)
-    assert bool(NetworkUpsampler(net)(_sample(4, 8, 8)).isnan().all())
+    assert bool(NetworkUpsampler(net)(problem(4, 8, 8)).isnan().all())
 
 
 def test_weights_that_do_not_fit_are_refused_and_change_nothing():
@@ -427,7 +357,7 @@ def test_weights_that_do_not_fit_are_refused_and_change_nothing():
 
 def test_other_scale_and_unknown_precision_are_refused():
     with pytest.raises(ValueError, match="scene: expected scale 4, the network's, got 2"):
-        NetworkUpsampler(_msg(4))(_sample(2, 8, 8))
+        NetworkUpsampler(_msg(4))(problem(2, 8, 8))
     with pytest.raises(ValueError, match="precision: expected"):
         NetworkUpsampler(_msg(4), "float16")
 

@@ -5,7 +5,6 @@ import pickle
 import re
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,28 +24,28 @@ CAMERA = dsr.Camera.from_fov(60, width=64, height=48)
 QUICK = "bicubic"
 
 
-def photo() -> np.ndarray:
+def photo():
     return np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
 
 
-def millimetres(number: int = 0) -> np.ndarray:
+def millimetres(number=0):
     """Return the room in half the photo's size as whole numbers, with a hole."""
     stored = np.round(1000 * room(CAMERA.rescale(32, 24), walk(number + 1)[-1])).astype(np.uint16)
     stored[5:7, 8:10] = 0
     return stored
 
 
-def metres(number: int = 0) -> np.ndarray:
+def metres(number=0):
     stored = millimetres(number)
     return np.where(stored > 0, (stored.astype(np.float64) * 1e-3).astype(np.float32), np.float32(np.nan))
 
 
-def tensor_photo() -> Tensor:
+def tensor_photo():
     return torch.from_numpy(photo()).permute(2, 0, 1)
 
 
 @pytest.fixture(scope="module")
-def expected() -> np.ndarray:
+def expected():
     return dsr.upsample(photo(), metres(), CAMERA, method=QUICK)
 
 
@@ -61,7 +60,7 @@ PHOTOS = {
     "tensor": tensor_photo,
     "float tensor": lambda: tensor_photo().float() / 255,
 }
-DEPTHS: dict[str, Any] = {
+DEPTHS = {
     "uint16": (millimetres, "mm"),
     "int32": (lambda: millimetres().astype(np.int32), 1e-3),
     "big-endian": (lambda: millimetres().astype(">u2"), "1/1000"),
@@ -74,7 +73,7 @@ DEPTHS: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("kind", [*PHOTOS, *DEPTHS])
-def test_photo_and_depth_are_taken_in_any_form(kind: str, expected: np.ndarray) -> None:
+def test_photo_and_depth_are_taken_in_any_form(kind, expected):
     make, unit = DEPTHS.get(kind, (metres, None))
     found = dsr.upsample(PHOTOS.get(kind, photo)(), make(), CAMERA, unit=unit, method=QUICK)
     assert (type(found), found.dtype) == (np.ndarray, np.float32)
@@ -82,7 +81,7 @@ def test_photo_and_depth_are_taken_in_any_form(kind: str, expected: np.ndarray) 
 
 
 @pytest.mark.parametrize("shape", [(24, 32), (1, 24, 32)])
-def test_tensor_gives_a_tensor_whatever_the_photo_is(shape: tuple[int, ...], expected: np.ndarray) -> None:
+def test_tensor_gives_a_tensor_whatever_the_photo_is(shape, expected):
     depth = torch.from_numpy(metres()).reshape(shape).requires_grad_()
     for rgb in (photo(), tensor_photo()):
         found = dsr.upsample(rgb, depth, CAMERA, method=QUICK)
@@ -93,14 +92,14 @@ def test_tensor_gives_a_tensor_whatever_the_photo_is(shape: tuple[int, ...], exp
     assert surface.render().shape == surface.filled.shape == surface.angle_error.shape == (1, 48, 64)
 
 
-def test_tensor_of_another_device_gives_one_there(expected: np.ndarray) -> None:
+def test_tensor_of_another_device_gives_one_there(expected):
     with pretend_cuda() as device:
         found = dsr.upsample(tensor_photo(), torch.from_numpy(metres()).to(device), CAMERA, method=QUICK, device="cpu")
         assert found.device == device
         np.testing.assert_array_equal(found[0].cpu().numpy(), expected)
 
 
-def test_batch_gives_what_its_pictures_give() -> None:
+def test_batch_gives_what_its_pictures_give():
     single = [dsr.upsample(photo(), metres(number), CAMERA, method=QUICK) for number in range(3)]
     photos, depths = np.stack([photo()] * 3), np.stack([metres(number) for number in range(3)])
     mask = np.ones((3, 24, 32), bool)
@@ -122,7 +121,7 @@ def test_batch_gives_what_its_pictures_give() -> None:
 
 
 _PICTURE = "rgb: expected a picture of shape (H, W, 3),"
-REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+REFUSED = {
     "whole numbers without a unit": (
         {"depth": millimetres()},
         "depth: expected floats in metres, or whole numbers with unit=.*, got uint16 of shape (24, 32)",
@@ -166,7 +165,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_wrong_argument_is_named_with_its_shape_and_type(case: str) -> None:
+def test_wrong_argument_is_named_with_its_shape_and_type(case):
     change, message = REFUSED[case]
     given = {"rgb": photo(), "depth": metres(), "camera": CAMERA, "method": QUICK, **change}
     pattern = re.escape(message).replace(r"\.\*", ".*")
@@ -175,18 +174,18 @@ def test_wrong_argument_is_named_with_its_shape_and_type(case: str) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_what_can_hardly_be_right_is_a_warning_at_the_line_that_called() -> None:
+def test_what_can_hardly_be_right_is_a_warning_at_the_line_that_called():
     with pytest.warns(UserWarning, match="farther than any depth camera measures; unit sets it") as caught:
         dsr.upsample(photo(), 1000 * metres(), CAMERA, method=QUICK)
     assert {Path(each.filename).name for each in caught} == {Path(__file__).name}
 
 
 @pytest.fixture(scope="module")
-def surface() -> dsr.Surface[np.ndarray]:
+def surface():
     return dsr.Upsampler(QUICK)(photo(), millimetres(), CAMERA, unit="mm")
 
 
-def test_surface_has_its_maps(surface: dsr.Surface[np.ndarray], expected: np.ndarray) -> None:
+def test_surface_has_its_maps(surface, expected):
     np.testing.assert_array_equal(surface.depth, expected)
     assert surface.filled.dtype == np.bool_
     assert [int(surface.filled.sum()), int(surface.filled[10:14, 16:20].sum())] == [16, 16]
@@ -197,7 +196,7 @@ def test_surface_has_its_maps(surface: dsr.Surface[np.ndarray], expected: np.nda
     assert surface.outliers is not None
 
 
-def test_renderings_are_those_of_the_normals(surface: dsr.Surface[np.ndarray]) -> None:
+def test_renderings_are_those_of_the_normals(surface):
     depth = torch.from_numpy(surface.depth)[None, None].double()
     normals = depth_to_normals(depth, CAMERA.rays()[None])
     np.testing.assert_allclose(surface.normals(), normals[0].permute(1, 2, 0).numpy(), atol=1e-6)
@@ -206,10 +205,10 @@ def test_renderings_are_those_of_the_normals(surface: dsr.Surface[np.ndarray]) -
         np.testing.assert_allclose(surface.render(3 * np.array(direction_of(light))), wanted, atol=1e-6)
     for wrong in ("e5", (0, 0, 0), (1, 2), ("a", 1, 2), 3.0):
         with pytest.raises(ValueError, match=r"^light: expected"):
-            surface.render(wrong)  # type: ignore[arg-type]
+            surface.render(wrong)
 
 
-def test_points_and_mesh_have_the_photos_colours_at_their_places(surface: dsr.Surface[np.ndarray]) -> None:
+def test_points_and_mesh_have_the_photos_colours_at_their_places(surface):
     every = surface.points(None)
     assert len(every.points) == 48 * 64
     np.testing.assert_allclose(every.points[:, 2], surface.depth.ravel(), rtol=1e-6)
@@ -227,7 +226,7 @@ def test_points_and_mesh_have_the_photos_colours_at_their_places(surface: dsr.Su
         surface.points(1e-9)
 
 
-def test_saved_surface_is_a_result_of_the_command(surface: dsr.Surface[np.ndarray], tmp_path: Path) -> None:
+def test_saved_surface_is_a_result_of_the_command(surface, tmp_path):
     files = surface.save(tmp_path / "out", ["depth", "renderings", "normals", "cloud", "mesh", "confidence", "input"])
     names = {path.relative_to(tmp_path / "out").as_posix() for path in files}
     assert {"depth.png", "depth_metres.tiff", "renderings/e1.png", "mesh.glb", "cloud.ply", "input.npz"} <= names
@@ -258,7 +257,7 @@ def test_saved_surface_is_a_result_of_the_command(surface: dsr.Surface[np.ndarra
     assert together
 
 
-def test_threads_that_share_an_upsampler_get_what_they_would_get_alone() -> None:
+def test_threads_that_share_an_upsampler_get_what_they_would_get_alone():
     upsampler = dsr.Upsampler()
     maps = [metres(number) for number in range(3)]
     alone = [upsampler(photo(), each, CAMERA).depth for each in maps]
@@ -268,41 +267,33 @@ def test_threads_that_share_an_upsampler_get_what_they_would_get_alone() -> None
         np.testing.assert_array_equal(first, second)
 
 
-def test_upsampler_and_surface_go_to_other_processes(surface: dsr.Surface[np.ndarray]) -> None:
+def test_upsampler_and_surface_go_to_other_processes(surface):
     there = pickle.loads(pickle.dumps(dsr.Upsampler(QUICK)))
     np.testing.assert_array_equal(there(photo(), metres(), CAMERA).depth, surface.depth)
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(surface)).depth, surface.depth)
 
 
-def frames(poses: list[Any]) -> list[tuple[Any, ...]]:
-    return [(photo(), metres(number), CAMERA, pose) for number, pose in enumerate(poses)]
+def watched(frames, taken):
+    """Yield frames, and their numbers into a list as they are asked for."""
+    for number, frame in enumerate(frames):
+        taken.append(number)
+        yield frame
 
 
-def test_stream_without_poses_gives_each_frame_as_it_comes() -> None:
-    taken: list[int] = []
-
-    def camera() -> Any:
-        for number, frame in enumerate(frames([None] * 4)):
-            taken.append(number)
-            yield frame[: 3 + number % 2]
-
-    upsampler = dsr.Upsampler(QUICK)
-    for number, surface in enumerate(upsampler.stream(camera())):
+def test_stream_without_poses_gives_each_frame_as_it_comes():
+    taken, upsampler = [], dsr.Upsampler(QUICK)
+    frames = [(photo(), metres(number), CAMERA, None)[: 3 + number % 2] for number in range(4)]
+    for number, surface in enumerate(upsampler.stream(watched(frames, taken))):
         assert taken[-1] == number
         np.testing.assert_array_equal(surface.depth, upsampler(photo(), metres(number), CAMERA).depth)
     assert taken == [0, 1, 2, 3]
 
 
-def test_stream_reads_no_further_than_frames_that_vote_and_names_a_wrong_one() -> None:
-    poses, taken = walk(8), []
-
-    def camera() -> Any:
-        for number, frame in enumerate(frames(poses)):
-            taken.append(number)
-            yield frame if number < 6 else (photo(), millimetres(), CAMERA)
-
+def test_stream_reads_no_further_than_frames_that_vote_and_names_a_wrong_one():
+    frames, taken = [(photo(), metres(number), CAMERA, pose) for number, pose in enumerate(walk(6))], []
+    frames += [(photo(), millimetres(), CAMERA)] * 2
     upsampler, ahead = dsr.Upsampler(QUICK), []
-    surfaces = upsampler.stream(camera(), neighbours=2)
+    surfaces = upsampler.stream(watched(frames, taken), neighbours=2)
     for _ in range(5):
         next(surfaces)
         ahead.append(taken[-1])
@@ -319,8 +310,8 @@ def test_stream_reads_no_further_than_frames_that_vote_and_names_a_wrong_one() -
     assert list(upsampler.stream([])) == []
 
 
-def test_frames_without_depth_and_wrong_ones_do_not_take_others_with_them() -> None:
-    frames: list[Any] = [(photo(), millimetres(number), CAMERA, walk(8)[number]) for number in range(5)]
+def test_frames_without_depth_and_wrong_ones_do_not_take_others_with_them():
+    frames = [(photo(), millimetres(number), CAMERA, walk(8)[number]) for number in range(5)]
     frames[2] = (photo(), np.zeros_like(millimetres()), CAMERA, walk(8)[2])
     found = list(dsr.Upsampler(QUICK).stream(frames, unit="mm"))
     assert [bool(np.isfinite(each.depth).any()) for each in found] == [True, True, False, True, True]
@@ -333,10 +324,10 @@ def test_frames_without_depth_and_wrong_ones_do_not_take_others_with_them() -> N
     assert len(seen) == 4
 
 
-def test_buffers_of_the_caller_may_be_used_again() -> None:
+def test_buffers_of_the_caller_may_be_used_again():
     buffer = torch.zeros(3, 48, 64)
 
-    def frames() -> Any:
+    def frames():
         for number in range(3):
             yield buffer.fill_(number / 4), torch.from_numpy(metres(number)), CAMERA, walk(8)[number]
 
@@ -346,7 +337,7 @@ def test_buffers_of_the_caller_may_be_used_again() -> None:
     assert not (surface.depth == 7).any()
 
 
-def test_masked_arrays_keep_their_mask_and_pictures_their_bits(expected: np.ndarray) -> None:
+def test_masked_arrays_keep_their_mask_and_pictures_their_bits(expected):
     masked = np.ma.masked_array(np.nan_to_num(metres(), nan=9.0), np.isnan(metres()))
     np.testing.assert_array_equal(dsr.upsample(photo(), masked, CAMERA, method=QUICK), expected)
     deep = Image.fromarray(np.full((48, 64), 30000, np.uint16))
@@ -356,10 +347,10 @@ def test_masked_arrays_keep_their_mask_and_pictures_their_bits(expected: np.ndar
         dsr.upsample(Image.fromarray(np.ones((48, 64), np.float32)), metres(), CAMERA, method=QUICK)
 
 
-def test_cameras_of_numpy_and_of_tensors_with_gradients_are_written(tmp_path: Path) -> None:
+def test_cameras_of_numpy_and_of_tensors_with_gradients_are_written(tmp_path):
     matrix = torch.tensor([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]], requires_grad=True)
     numbers = matrix.detach().numpy()
-    camera = dsr.Camera(np.int64(64), np.int64(48), numbers[0, 0], numbers[1, 1], numbers[0, 2], numbers[1, 2])  # type: ignore[arg-type]
+    camera = dsr.Camera(np.int64(64), np.int64(48), numbers[0, 0], numbers[1, 1], numbers[0, 2], numbers[1, 2])
     assert camera == dsr.Camera.from_matrix(matrix, 64, 48) == dsr.Camera.from_matrix(matrix.bfloat16(), 64, 48)
     dsr.Upsampler(QUICK)(photo(), metres(), camera).save(tmp_path / "out", ["depth"])
     assert read_result(tmp_path / "out", "out").camera == camera

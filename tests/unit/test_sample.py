@@ -9,7 +9,7 @@ import torch
 
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera, baseline_times_focal
-from dsr.sample import CENTIMETRES, DepthSample, Scene, Unit
+from dsr.sample import DepthSample, Scene, Unit
 
 CAMERA = Camera(width=8, height=4, fx=9.0, fy=9.0, cx=3.5, cy=1.5)
 
@@ -181,13 +181,6 @@ def test_regions_are_cropped_handed_on_and_read(tmp_path):
     for region, message in ((planes[:, 1:], "expected shape"), (planes.bool(), "expected uint8")):
         with pytest.raises(ValueError, match=f"hall: region planes: {message}"):
             _scene(regions={"planes": region})
-
-
-def test_unit_converts_depth():
-    depth = torch.tensor([2.0, math.nan, 3.0])
-    levels = Unit("levels", inverse=True, factor=300.0, offset=64.0)
-    torch.testing.assert_close(CENTIMETRES.convert(depth), torch.tensor([200, math.nan, 300]), equal_nan=True)
-    torch.testing.assert_close(levels.convert(depth), torch.tensor([86, math.nan, 36.0]), equal_nan=True)
 
 
 @pytest.mark.parametrize("content", [b"", b"text", None])

@@ -1,12 +1,17 @@
-"""Frames that vote: less noise, occlusions and movement left out, holes filled by agreement."""
+"""Frames that vote: less noise, occlusions and movement left out; and poses that the depth maps contradict."""
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
+from small_frames import room as small_room
+from small_frames import walk
+from small_scenes import sphere_depth
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import as_rigid
+from dsr.geometry.poses import PosedMap, as_rigid, check_poses, invert
+from dsr.geometry.poses import sample as sampled
 from dsr.inference.sequences import View, fuse_views
 from dsr.synthetic.raycast import rotation
 
@@ -22,11 +27,7 @@ def room(own, ball=0.0):
     rays = torch.einsum("ij,jhw->ihw", torch.from_numpy(own[:3, :3]), CAMERA.rays())
     eye = torch.from_numpy(own[:3, 3])
     wall = (2.5 - eye[2]) / rays[2]
-    to_ball = torch.tensor([ball, 0.0, 1.5]) - eye
-    square, half = (rays**2).sum(0), (rays * to_ball[:, None, None]).sum(0)
-    root = half**2 - square * ((to_ball**2).sum() - 0.3**2)
-    hit = torch.where(root > 0, (half - root.clamp(min=0).sqrt()) / square, torch.inf)
-    return torch.minimum(wall, hit)[None]
+    return torch.minimum(wall, sphere_depth(rays, torch.tensor([ball, 0.0, 1.5]) - eye, 0.3))[None]
 
 
 def noisy(depth, seed, deviation=0.01):
@@ -112,3 +113,120 @@ def test_holes_are_filled_by_what_others_see_and_stay_without():
 def test_invalid_views_are_refused(depth, own, message):
     with pytest.raises(ValueError, match=message):
         View(depth, CAMERA, own)
+
+
+SMALL = Camera.centred(64, 48, 52.0)
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+NED = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+"""The axes forward, right, down of a camera in its frame right, down, forward."""
+
+
+def scaled(pose, factor):
+    changed = pose.copy()
+    changed[:3, 3] *= factor
+    return changed
+
+
+def turned(pose, change):
+    changed = pose.copy()
+    changed[:3, :3] = change(pose[:3, :3])
+    return changed
+
+
+def scalar_first(turn):
+    """Return what x y z w is read as where w x y z is written."""
+    x, y, z, w = Rotation.from_matrix(turn).as_quat()
+    return Rotation.from_quat((w, x, y, z)).as_matrix()
+
+
+WRONG = [
+    ("from world to camera", invert),
+    ("in millimetres", lambda pose: scaled(pose, 1000)),
+    ("in centimetres", lambda pose: scaled(pose, 100)),
+    ("10 times too small", lambda pose: scaled(pose, 0.1)),
+    ("of cameras with y up and z backward", lambda pose: pose @ OPENGL),
+    ("of cameras with x forward and z down", lambda pose: pose @ NED),
+    ("with rotations by columns", lambda pose: turned(pose, np.transpose)),
+    ("with quaternions w x y z", lambda pose: turned(pose, scalar_first)),
+    ("from world to camera, in millimetres", lambda pose: scaled(invert(pose), 1000)),
+    ("from world to camera, of cameras with y up and z backward", lambda pose: invert(pose @ OPENGL)),
+]
+
+
+def checked(poses, change=lambda pose: pose, depth=small_room):
+    """Return what is said of poses that were changed, of maps with the noise of a sensor."""
+
+    def load(number):
+        draws = np.random.default_rng(number).standard_normal((SMALL.height, SMALL.width))
+        return PosedMap(depth(SMALL, poses[number]) * (1 + 0.005 * draws), SMALL, change(poses[number]))
+
+    return check_poses(len(poses), load)
+
+
+def wall(camera, pose):
+    return 2 / np.einsum("j,jhw->hw", pose[2, :3], camera.rays().numpy())
+
+
+@pytest.mark.parametrize(("name", "change"), WRONG, ids=[name for name, _ in WRONG])
+def test_wrong_reading_is_reported_by_its_name_with_figures(name, change):
+    found = checked(walk(8), change)
+    assert found.code == "poses"
+    assert name in found.text.removeprefix("the poses are probably ").split(" or ")
+    assert found.value > 0.25
+
+
+@pytest.mark.parametrize(
+    "poses",
+    [walk(8), walk(2), walk(60, 0.004, 0.3), walk(8, 0.0), walk(8, 0.08, 0.0), walk(20, 0.0, 0.0), walk(1), []],
+    ids=["photos", "two", "video", "rotation", "translation", "tripod", "one", "none"],
+)
+def test_right_poses_are_silent(poses):
+    assert checked(poses) is None
+
+
+@pytest.mark.parametrize(("name", "change"), WRONG, ids=[name for name, _ in WRONG])
+def test_wall_along_which_the_camera_moves_shows_nothing(name, change):
+    del name
+    poses = [np.eye(4) for _ in range(12)]
+    for number, pose in enumerate(poses):
+        pose[:2, 3] = 0.03 * number, 0.01 * number
+    found = checked(poses, change, wall)
+    assert found is None or found.code != "poses"
+
+
+def test_camera_that_hardly_moves_is_not_far_away_in_the_next_frame():
+    poses = [np.eye(4) + 0.03 * number * np.eye(4, k=3) for number in range(12)]
+    assert checked(poses, depth=wall) is None
+    found = checked(poses, lambda pose: scaled(pose, 1000), wall)
+    assert (found.code, found.value) == ("poses-far", pytest.approx(1000 * 0.03 / 2, rel=0.05))
+    assert checked(poses, lambda pose: scaled(pose, 1 / 1000), wall) is None
+
+
+def test_poses_that_no_reading_explains_disagree():
+    poses = walk(8, 0.02, 0.5)
+    rng = np.random.default_rng(3)
+    strange = {id(pose): Rotation.from_rotvec(rng.normal(0, 12, 3), degrees=True).as_matrix() for pose in poses}
+    found = checked(poses, lambda pose: turned(pose, lambda turn: turn @ strange[id(pose)]))
+    assert found.code == "poses-disagree"
+
+
+def test_frames_that_cannot_be_read_are_left_out():
+    poses = walk(8)
+    assert check_poses(8, lambda number: None) is None
+    some = check_poses(8, lambda n: None if n == 1 else PosedMap(small_room(SMALL, poses[n]), SMALL, invert(poses[n])))
+    assert some is not None
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("factor", [1e-300, 1e30, 1e307])
+def test_poses_of_any_magnitude_are_compared(factor):
+    found = checked(walk(4), lambda pose: scaled(pose, factor))
+    assert found is None or found.code.startswith("poses")
+
+
+def test_frames_are_sampled_within_the_sequence_and_few_of_a_long_one():
+    for count in (0, 1, 2, 5, 31, 100_000):
+        groups = sampled(count)
+        assert all(0 <= number < count for group in groups for number in group)
+        assert sum(map(len, groups)) <= 20
+        assert (len(groups) > 0) == (count > 1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from reference_metrics import LIGHTS as PROTOCOL_LIGHTS
-from reference_metrics import Intrinsics, Reference
+from reference_metrics import Intrinsics, normals_of
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import LIGHT_NAMES
@@ -14,12 +14,6 @@ CAMERA = Camera(width=11, height=7, fx=9.0, fy=12.0, cx=4.3, cy=3.9)
 PLANES = [(0.0, 0.0, -1.0), (0.3, -0.2, -1.0), (-0.5, 0.1, -0.8), (0.2, 0.6, -1.0)]
 
 
-def _plane(camera, normal, offset=-2.0):
-    """Return the depth of the plane n . P = offset, (1, 1, H, W)."""
-    facing = torch.einsum("c,chw->hw", torch.tensor(normal, dtype=torch.float64), camera.rays())
-    return (offset / facing)[None, None]
-
-
 def _random(camera, seed=0):
     shape = (1, 1, camera.height, camera.width)
     return torch.from_numpy(np.random.default_rng(seed).uniform(1.0, 1.3, shape))
@@ -27,13 +21,15 @@ def _random(camera, seed=0):
 
 def _cross_product_normals(z):
     """Return the protocol's normals, (H, W, 3); NaN where a point that they need is."""
-    return Reference(z, z, Intrinsics(CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)).normals[0]
+    rays = Intrinsics(CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy).rays(*z.shape)
+    return normals_of(z[..., None] * rays)
 
 
 @pytest.mark.parametrize("normal", PLANES)
 def test_depth_to_normals_gives_the_plane_normal_at_every_pixel(normal):
-    normals = depth_to_normals(_plane(CAMERA, normal), CAMERA.rays()[None])
     expected = torch.tensor(normal, dtype=torch.float64)
+    depth = -2 / torch.einsum("c,chw->hw", expected, CAMERA.rays())
+    normals = depth_to_normals(depth[None, None], CAMERA.rays()[None])
     expected = (expected / expected.norm())[None, :, None, None].expand_as(normals)
     torch.testing.assert_close(normals, expected, rtol=0, atol=1e-9)
 

@@ -5,16 +5,10 @@ import pytest
 import torch
 from scipy import sparse
 from scipy.sparse.linalg import splu
-from small_scenes import disparity_of, plane, random_scene, sample_of, step
+from small_scenes import disparity_of, normal, plane, random_scene, sample_of, step
 
 from dsr.geometry.camera import to_range
-from dsr.methods.classical.tgv import (
-    TotalGeneralisedVariation,
-)
-
-
-def _normals(*shape, seed=0):
-    return torch.from_numpy(np.random.default_rng(seed).normal(size=shape))
+from dsr.methods.classical.tgv import TotalGeneralisedVariation
 
 
 def _means(x, scale):
@@ -131,7 +125,7 @@ def test_block_means_are_the_input_without_a_data_weight(scale, size):
 def test_automatic_weight_smooths_a_noisy_plane_and_reproduces_a_clean_one():
     flat = plane()
     means = torch.from_numpy(_means(flat, 4))
-    noisy = means + 0.02 * (means.max() - means.min()) * _normals(*means.shape)
+    noisy = means + 0.02 * (means.max() - means.min()) * normal(*means.shape)
     errors = []
     for weight in (None, "auto"):
         tgv = TotalGeneralisedVariation(iterations=300, data_weight=weight)
@@ -150,7 +144,7 @@ def _upsampled(tgv, lr):
 
 
 def test_batch_equals_its_samples_one_at_a_time():
-    coarse, photos = _normals(2, 1, 4, 6).sigmoid(), _normals(2, 3, 16, 24, seed=1).sigmoid()
+    coarse, photos = normal(2, 1, 4, 6).sigmoid(), normal(2, 3, 16, 24, seed=1).sigmoid()
     method = TotalGeneralisedVariation(iterations=100, tolerance=0.0)
     together = method.minimise(photos, coarse, 4).values
     for number in range(2):
@@ -163,7 +157,7 @@ def test_iteration_stops_at_convergence_and_reports_progress():
     sample = sample_of(plane())
     TotalGeneralisedVariation(iterations=5000)(sample, lambda done, most: reported.append((done, most)))
     assert reported == [(50, 5000), (5000, 5000)]
-    coarse, photo = _normals(1, 1, 4, 6).sigmoid(), _normals(1, 3, 16, 24, seed=1).sigmoid()
+    coarse, photo = normal(1, 1, 4, 6).sigmoid(), normal(1, 3, 16, 24, seed=1).sigmoid()
     found = TotalGeneralisedVariation(iterations=5000, tolerance=2e-3).minimise(photo, coarse, 4)
     assert 50 * len(found.moved) == found.iterations < 5000
     assert found.moved[-1] < 2e-3 <= min(found.moved[:-1])

@@ -44,6 +44,7 @@ from dsr.training.settings import PatchSettings
 from dsr.utils.checkpoints import Divergence, DivergenceError, fit, make_trainer
 from dsr.utils.configuration import ConfigError
 
+CPU = torch.device("cpu")
 BOX = Downsampling("box")
 X2 = Degradation(2, BOX)
 CAMERA = Camera(width=40, height=36, fx=40.0, fy=40.0, cx=20.0, cy=18.0)
@@ -57,27 +58,18 @@ pytestmark = [
 ]
 
 
-def _four(value):
-    return torch.full((1, 1, 1, 1), value, dtype=torch.float64)
-
-
-def _batch(depth, camera, coarse):
-    """Return a batch of one map whose low-resolution disparities span ``coarse``."""
-    return {
-        "depth": depth[None],
-        "rays": camera.rays()[None],
-        "bf": _four((camera.baseline or 0.2) * camera.fx),
-        "doffs": _four(camera.doffs),
-        "disparity_lr": torch.tensor(coarse, dtype=torch.float64).view(1, 1, 1, 2),
-    }
-
-
 STEREO = Camera(width=13, height=12, fx=20.0, fy=25.0, cx=4.0, cy=7.0, baseline=0.5, doffs=1.0)
 
 
 def _wall():
     """Return a wall at 2 m whose disparity is 0.5 * 20 / 2 - 1 = 4 pixels, of low-resolution ones from 3 to 5."""
-    return _batch(torch.full((1, 12, 13), 2.0, dtype=torch.float64), STEREO, (3.0, 5.0))
+    return {
+        "depth": torch.full((1, 1, 12, 13), 2.0, dtype=torch.float64),
+        "rays": STEREO.rays()[None],
+        "bf": torch.full((1, 1, 1, 1), 10.0, dtype=torch.float64),
+        "doffs": torch.ones((1, 1, 1, 1), dtype=torch.float64),
+        "disparity_lr": torch.tensor([[[[3.0, 5.0]]]], dtype=torch.float64),
+    }
 
 
 def _ramp(slope, height=4.0):
@@ -133,9 +125,6 @@ def test_disparity_at_or_beyond_infinity_has_no_depth():
     assert to_depth(disparity, _wall())[0, 0, 0, 2] == pytest.approx(20)
 
 
-# The balanced weight
-
-
 def _plane(baseline=None, doffs=0.0, slope=0.02, fx=80.0):
     """Return the tensors of the plane with d + doffs = slope u + 3, 100 columns wide."""
     camera = Camera(width=100, height=4, fx=fx, fy=70.0, cx=40.0, cy=2.0, baseline=baseline, doffs=doffs)
@@ -160,9 +149,6 @@ def test_balanced_weight_is_the_median_over_the_patches():
     assert balance_weight(patches) == balance_weight(patches[2:])
 
 
-# The schedule
-
-
 def _rates(steps, warmup, count):
     """Return the learning rates of a schedule as fractions of the highest."""
     optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
@@ -182,9 +168,6 @@ def test_learning_rate_warms_up_linearly_and_falls_as_a_cosine_to_zero():
     assert rates[20] == rates[25] == pytest.approx(0, abs=1e-15)
 
 
-# The module
-
-
 def _scene(seed, holes=0.0):
     """Return a wavy surface with a photo that shows its waves."""
     random = np.random.default_rng(seed)
@@ -196,10 +179,10 @@ def _scene(seed, holes=0.0):
     return Scene("set", f"s{seed}", rgb, CAMERA, depth)
 
 
-def _module(network=None, *, scale=2, **settings):
+def _module(network=None, **settings):
     torch.manual_seed(0)
     metrics = functools.partial(visual_metrics, network)
-    return SuperResolution(MSGNet(scale, "dsr"), DepthObjective("lap1", 0.1), metrics=metrics, **settings)
+    return SuperResolution(MSGNet(2, "dsr"), DepthObjective("lap1", 0.1), metrics=metrics, **settings)
 
 
 def _trainer(folder, **settings):
@@ -209,14 +192,14 @@ def _trainer(folder, **settings):
     )
 
 
-class _Losses(Callback):
-    """What every training step returned."""
+class _Watch(Callback):
+    """Keeps what ``look`` finds in the module and in what a training step returned, after each step."""
 
-    def __init__(self):
-        self.values = []
+    def __init__(self, look):
+        self.look, self.seen = look, []
 
     def on_train_batch_end(self, trainer, pl_module, outputs, *_):
-        self.values.append(float(outputs["loss"]))
+        self.seen.append(self.look(pl_module, outputs))
 
 
 def _one_batch():
@@ -226,28 +209,22 @@ def _one_batch():
 
 @pytest.mark.parametrize("mixed", [False, True])
 def test_training_loss_is_the_objective_of_the_networks_output_in_full_precision(tmp_path, mixed):
-    losses, module = _Losses(), _module()
+    losses, module = _Watch(lambda _, outputs: float(outputs["loss"])), _module()
     [batch] = _one_batch()
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=mixed):
         disparity = module.net.upsample(batch["rgb"], batch["disparity_lr"], batch["min_max"])
     expected = float(module.objective(Answer(disparity), batch)["loss"])
     precision = "bf16-mixed" if mixed else "32-true"
     _trainer(tmp_path, max_steps=1, callbacks=[losses], precision=precision).fit(module, _one_batch())
-    assert losses.values == pytest.approx([expected], rel=2e-5)
+    assert losses.seen == pytest.approx([expected], rel=2e-5)
 
 
 def test_weight_average_follows_the_weights_with_its_decay(tmp_path):
-    seen = []
-
-    class _Watch(Callback):
-        def on_train_batch_end(self, trainer, pl_module, *_):
-            seen.append(pl_module.net.stem.conv.weight.detach().clone())
-
-    module = _module(average=0.3)
+    watch, module = _Watch(lambda module, _: module.net.stem.conv.weight.detach().clone()), _module(average=0.3)
     expected = module.net.stem.conv.weight.detach().clone()
     assert all(map(torch.equal, module.net.parameters(), module.average.parameters()))
-    _trainer(tmp_path, max_epochs=9, callbacks=[_Watch()]).fit(module, _one_batch())
-    for step, weight in enumerate(seen, start=1):
+    _trainer(tmp_path, max_epochs=9, callbacks=[watch]).fit(module, _one_batch())
+    for step, weight in enumerate(watch.seen, start=1):
         decay = min(0.3, step / (step + 9))
         expected = decay * expected + (1 - decay) * weight
     torch.testing.assert_close(module.average.stem.conv.weight, expected)
@@ -451,13 +428,10 @@ class Scripted(lightning.LightningModule):
         return torch.optim.SGD(self.parameters(), lr=0.25)
 
 
-def train(folder, module, steps=8, interval=2, callbacks=(), patience=3, accumulate=1):
-    """Train with a checkpoint after each validation; return the trainer."""
+def train(folder, module, steps=8, accumulate=1):
+    """Train with a validation and a checkpoint after every second step; return the trainer."""
     last = ModelCheckpoint(folder, "last", enable_version_counter=False, save_on_train_epoch_end=False)
-    trainer = make_trainer(
-        torch.device("cpu"), steps, interval, callbacks=[Divergence(patience), last, *callbacks], logger=False,
-        accumulate=accumulate,
-    )  # fmt: skip
+    trainer = make_trainer(CPU, steps, 2, callbacks=[Divergence(3), last], logger=False, accumulate=accumulate)
     loader = DataLoader(range(steps * accumulate), batch_size=None)
     fit(trainer, module, loader, val_dataloaders=DataLoader(range(1), batch_size=None))
     return trainer
@@ -493,9 +467,6 @@ def test_few_steps_without_a_finite_loss_are_tolerated(tmp_path):
 def test_steps_count_rather_than_the_batches_of_a_step(tmp_path):
     trainer = train(tmp_path, Scripted(dict.fromkeys(range(3, 8), NAN)), steps=6, accumulate=2)
     assert trainer.global_step == 6
-
-
-CPU = torch.device("cpu")
 
 
 @pytest.fixture(autouse=True)

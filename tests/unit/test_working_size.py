@@ -1,14 +1,11 @@
 """The noise of a sensor's map is distinguished from shape, and the map is worked on at the size that it suggests."""
 
 import shutil
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from dsr.data.rendered import Procedural
 from dsr.geometry.camera import Camera
@@ -21,16 +18,18 @@ from dsr.sample import DepthSample
 from dsr.utils.compute_device import fast_precision
 
 SIZE = (480, 640)
+CAMERA = Camera.centred(SIZE[1], SIZE[0], 600.0)
+GREY = torch.full((3, *SIZE), 0.5)
 
 
-def room() -> np.ndarray:
+def room():
     """Return the inverse depth of a floor and two walls, the nearer one in front."""
     v, u = np.mgrid[: SIZE[0], : SIZE[1]].astype(np.float64)
     values = np.where(v > 320, 0.3 + 0.001 * (v - 320), 0.3 + 0.0001 * u)
     return np.where((u > 60) & (u < 190) & (v > 80) & (v < 400), 0.8 - 0.0002 * v, values)
 
 
-def noisy(width: float, deviation: float = 0.004) -> Tensor:
+def noisy(width, deviation=0.004):
     """Return depth of the room, (1, h, w), with noise of a full width at half maximum, in steps of a millimetre."""
     noise = np.random.default_rng(0).standard_normal(SIZE)
     if width > 1:
@@ -39,35 +38,31 @@ def noisy(width: float, deviation: float = 0.004) -> Tensor:
     return torch.from_numpy(np.round(1e3 / inverse) / 1e3)[None]
 
 
+WAVES = GREY[:, :240, :320], noisy(20)[:, 100:340, 30:350], CAMERA.crop(100, 30, 240, 320)
+
+
 @pytest.mark.parametrize("width", [3, 6, 10, 16, 24])
-def test_noise_is_found_with_its_strength_and_extent(width: float) -> None:
+def test_noise_is_found_with_its_strength_and_extent(width):
     found = find_noise(noisy(width))
-    assert found is not None
     assert found.extent == pytest.approx(width, rel=0.2)
     assert found.deviation == pytest.approx(0.004 * float(noisy(width).median()), rel=0.35)
 
 
-def test_map_without_noise_has_none() -> None:
+def test_surfaces_without_noise_have_none_though_they_have_bumps(dsr_cache):
     assert find_noise(torch.from_numpy(1 / room())[None]) is None
-
-
-def test_rendered_surfaces_are_not_taken_for_noise(dsr_cache: Path) -> None:
-    source = Procedural(count=3, size=256)
-    found = [find_noise(source.load(name).depth) for name in source.scenes()]  # type: ignore[arg-type]
+    bumps = cv2.GaussianBlur(np.random.default_rng(0).standard_normal(SIZE), (0, 0), 8)
+    assert find_noise(torch.from_numpy(1 / (room() * (1 + 0.004 * bumps / bumps.std())))[None]) is None
+    source = Procedural(count=2, size=256)
+    found = [find_noise(source.load(name).depth) for name in source.scenes()]
     assert all(noise is None or working_size_of(noise.extent) == 1 for noise in found)
 
 
-def test_bumps_are_no_noise() -> None:
-    bumps = cv2.GaussianBlur(np.random.default_rng(0).standard_normal(SIZE), (0, 0), 8)
-    assert find_noise(torch.from_numpy(1 / (room() * (1 + 0.004 * bumps / bumps.std())))[None]) is None
-
-
 @pytest.mark.parametrize(("extent", "factor"), [(1, 1), (9, 1), (10, 4), (20, 8), (37, 16), (200, 16)])
-def test_size_is_divided_by_less_than_half_of_the_extent(extent: float, factor: int) -> None:
+def test_size_is_divided_by_less_than_half_of_the_extent(extent, factor):
     assert working_size_of(extent) == factor
 
 
-def test_medians_of_planes_are_planes_and_blocks_that_are_mostly_holes_are_holes() -> None:
+def test_medians_of_planes_are_planes_and_blocks_that_are_mostly_holes_are_holes():
     v, u = torch.meshgrid(torch.arange(12).double(), torch.arange(16).double(), indexing="ij")
     plane = (1 + 0.1 * u + 0.03 * v)[None]
     found = reduce_by_medians(plane, 4)
@@ -81,7 +76,7 @@ def test_medians_of_planes_are_planes_and_blocks_that_are_mostly_holes_are_holes
     assert float(reduce_by_medians(plane, 4)[0, 0, 0]) == 1
 
 
-def test_calm_errors_are_no_larger_than_the_noise_leaves_and_others_stay() -> None:
+def test_calm_errors_are_no_larger_than_the_noise_leaves_and_others_stay():
     spread = torch.full((1, 8, 8), 0.02)
     spread[0, 0, 0] = 0.2
     measured = torch.ones(1, 4, 4)
@@ -95,30 +90,25 @@ def test_calm_errors_are_no_larger_than_the_noise_leaves_and_others_stay() -> No
     assert float(unsure[0, 6, 4]) == 1
 
 
-def test_evaluation_works_on_a_sensor_map_at_the_size_that_upsample_chooses() -> None:
-    camera = Camera.centred(SIZE[1], SIZE[0], 600.0)
+def test_evaluation_works_on_a_sensor_map_at_the_size_that_upsample_chooses():
     run = Run(precision=fast_precision(torch.device("cpu")))
-    sample = DepthSample("set", "room", torch.full((3, *SIZE), 0.5), noisy(20), camera, camera, 1)
+    sample = DepthSample("set", "room", GREY, noisy(20), CAMERA, CAMERA, 1)
     surface = select(read_recipe("facets"), 1, measured=True).build(run).surface(sample)
-    expected = upsample_surface(sample.rgb, sample.depth_lr, camera, device="cpu", fill="all")
-    assert surface.noise is not None
+    expected = upsample_surface(sample.rgb, sample.depth_lr, CAMERA, device="cpu", fill="all")
     assert surface.noise.reduced > 1
     for found, wanted in ((surface.depth, expected.depth), (surface.depth_error, expected.depth_error)):
-        assert found is not None
-        assert wanted is not None
         assert torch.equal(found, wanted)
     assert select(read_recipe("facets"), 1).direct
     assert select(read_recipe("facets", {"noise": 0}), 1, measured=True).direct
 
 
-def test_notes_of_an_evaluation_name_a_smaller_size_only() -> None:
-    camera, rgb = Camera.centred(SIZE[1], SIZE[0], 600.0), torch.full((3, *SIZE), 0.5)
+def test_notes_of_an_evaluation_name_a_smaller_size_only():
     method = select(read_recipe("facets"), 1, measured=True).build(Run())
-    notes = [method.describe(DepthSample("set", "room", rgb, noisy(width), camera, camera, 1)) for width in (20, 3)]
+    notes = [method.describe(DepthSample("set", "room", GREY, noisy(width), CAMERA, CAMERA, 1)) for width in (20, 3)]
     assert notes == ["480 x 640 depth to 480 x 640 by facets x1, worked on at 1/8", ""]
 
 
-def test_weights_of_a_sensor_map_belong_to_the_run(tmp_path: Path) -> None:
+def test_weights_of_a_sensor_map_belong_to_the_run(tmp_path):
     files = select(read_recipe("facets"), 1, measured=True).files()
     assert {"facets_x2", "facets_x4", "facets_x8", "facets_x16"} <= {file.stem for file in files}
     own = tmp_path / "own.safetensors"
@@ -128,20 +118,17 @@ def test_weights_of_a_sensor_map_belong_to_the_run(tmp_path: Path) -> None:
     assert not selected.direct
 
 
-def test_errors_of_correlated_noise_are_limited_at_the_map_s_own_size() -> None:
-    depth, camera = noisy(8.5, 0.002), Camera.centred(SIZE[1], SIZE[0], 600.0)
+def test_errors_of_correlated_noise_are_limited_at_the_map_s_own_size():
+    depth = noisy(8.5, 0.002)
     noise = find_noise(depth)
-    assert noise is not None
-    surface = upsample_surface(torch.full((3, *SIZE), 0.5), depth, camera)
-    assert surface.noise is not None
+    surface = upsample_surface(GREY, depth, CAMERA)
     assert surface.noise.reduced == 1
-    assert surface.depth_error is not None
     stated = float((surface.depth_error / surface.depth**2).nanmedian())
     left = 0.36 * noise.deviation / noise.distance**2
     assert stated < 1.18 * left  # 1.26 of it is what the network states
 
 
-def test_evaluated_method_that_states_no_errors_has_none() -> None:
+def test_evaluated_method_that_states_no_errors_has_none():
     camera = Camera.centred(48, 36, 50.0)
     depth = 2 + torch.linspace(0, 1, 48, dtype=torch.float64).expand(1, 36, 48)
     sample = DepthSample("set", "hall", torch.full((3, 36, 48), 0.5), depth, camera, camera, 1)
@@ -150,7 +137,7 @@ def test_evaluated_method_that_states_no_errors_has_none() -> None:
     assert surface.depth.dtype == torch.float64
 
 
-def test_result_is_the_smoother_one_where_both_are_calm() -> None:
+def test_result_is_the_smoother_one_where_both_are_calm():
     one, two = torch.full((1, 8, 16), 0.5), torch.full((1, 8, 16), 0.6)
     spread = torch.full((1, 8, 16), 0.01)
     spread[..., :3] = 0.1
@@ -162,49 +149,40 @@ def test_result_is_the_smoother_one_where_both_are_calm() -> None:
     assert mix_where_calm(found, InverseSurface(two), torch.ones(1, 4, 8), reach=2) is found
 
 
-def test_waves_of_a_sensor_are_averaged_and_size_can_be_chosen() -> None:
-    depth = noisy(20)
-    camera = Camera.centred(SIZE[1], SIZE[0], 600.0)
-    rgb = torch.full((3, *SIZE), 0.5)
+def test_waves_of_a_sensor_are_averaged_and_size_can_be_chosen():
     errors = {}
     for size in (None, 1, 8):
-        surface = upsample_surface(rgb, depth, camera, working_size=size)
-        wall = surface.depth[0, 20:300, 220:620].double()
-        errors[size] = float((wall.reciprocal() / torch.from_numpy(room()[20:300, 220:620]) - 1).std())
+        surface = upsample_surface(*WAVES, working_size=size)
+        wall = surface.depth[0, :200, 190:].double()
+        errors[size] = float((wall.reciprocal() / torch.from_numpy(room()[100:300, 220:350]) - 1).std())
         assert surface.noise is not None
     assert errors[None] == errors[8] < 0.75 * errors[1]
 
 
-def test_maps_that_are_known_to_be_clean_are_worked_on_as_they_are() -> None:
-    depth, camera = noisy(20), Camera.centred(SIZE[1], SIZE[0], 600.0)
-    rgb = torch.full((3, *SIZE), 0.5)
-    reported = upsample_surface(rgb, depth, camera, settings={"noise": 0.0})
-    assert torch.equal(
-        reported.depth, upsample_surface(rgb, depth, camera, working_size=1, settings={"noise": 0.0}).depth
-    )
+def test_maps_that_are_known_to_be_clean_are_worked_on_as_they_are():
+    reported, whole = (upsample_surface(*WAVES, working_size=size, settings={"noise": 0.0}) for size in (None, 1))
+    assert torch.equal(reported.depth, whole.depth)
 
 
-def test_board_before_a_stereo_camera_is_worked_on_at_an_eighth_or_less(shared: Path) -> None:
+def test_board_before_a_stereo_camera_is_worked_on_at_an_eighth_or_less(shared):
     folder = shared / "real" / "stereo_board" / "depth"
     for name, factor in (("8", 8), ("14", 16)):
         depth = torch.from_numpy(cv2.imread(str(folder / f"{name}.png"), cv2.IMREAD_UNCHANGED).astype(np.float32))[None]
         found = find_noise(torch.where(depth > 0, depth / 1000, torch.nan))
-        assert found is not None
         assert working_size_of(found.extent) == factor
 
 
 @pytest.mark.parametrize(
-    ("scale", "options"),
-    [(None, {"method": "bicubic"}), (4, {}), (None, {"settings": {"noise": 0.0}})],
+    ("larger", "size", "options", "expected"),
+    [
+        *((1, 8, options, ".* to take 8") for options in ({"method": "bicubic"}, {"scale": 4})),
+        (1, 8, {"settings": {"noise": 0.0}}, ".* to take 8"),
+        (4, 8, {}, "at most 4 for"),
+        (4, 3, {}, "one of 1, 2, 4, 8, 16, got 3"),
+    ],
 )
-def test_size_that_would_have_no_effect_is_refused(scale: int | None, options: dict[str, Any]) -> None:
-    camera = Camera.centred(SIZE[1], SIZE[0], 600.0)
-    with pytest.raises(ValueError, match=r"^working_size: expected .* to take 8"):
-        upsample_surface(torch.full((3, *SIZE), 0.5), noisy(20), camera, scale, working_size=8, **options)
-
-
-@pytest.mark.parametrize(("size", "expected"), [(8, "at most 4 for"), (3, "one of 1, 2, 4, 8, 16, got 3")])
-def test_size_for_which_there_are_no_weights_is_refused(size: int, expected: str) -> None:
-    camera = Camera.centred(4 * SIZE[1], 4 * SIZE[0], 2400.0)
+def test_size_without_effect_or_weights_is_refused(larger, size, options, expected):
+    camera = CAMERA.rescale(larger * SIZE[1], larger * SIZE[0])
+    rgb = torch.full((3, camera.height, camera.width), 0.5)
     with pytest.raises(ValueError, match=f"^working_size: expected {expected}"):
-        upsample_surface(torch.full((3, 4 * SIZE[0], 4 * SIZE[1]), 0.5), noisy(2), camera, working_size=size)
+        upsample_surface(rgb, noisy(2), camera, working_size=size, **options)

@@ -17,12 +17,11 @@ import subprocess
 import sys
 import time
 import webbrowser
-from collections.abc import Awaitable, Callable, Generator, Iterator
+from collections.abc import Awaitable, Callable, Generator, Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
 from omegaconf import OmegaConf
 from rich.console import Console
 
@@ -34,7 +33,7 @@ from dsr.io.pairs import PHOTO_SUFFIXES
 from dsr.methods.recipe import list_methods, read_recipe
 from dsr.utils.console import show
 from dsr.utils.guards import free_memory, refusing
-from dsr.utils.progress import megabytes, show_length
+from dsr.utils.progress import megabytes
 from dsr.utils.versions import how_to_install
 
 _PRIVATE = {"GRADIO_ANALYTICS_ENABLED": "False", "HF_HUB_OFFLINE": "1"}
@@ -43,9 +42,7 @@ _LARGEST_FILE = 8 << 30
 _BETWEEN_LOOKS = 0.3  # seconds
 _KEPT = 3600  # seconds for which an upload is kept
 _UNITS = ["mm", "cm", "m", "1/5000", "1/1000", "1/10000", "sunrgbd"]
-_CHOICES = ("--depth-unit", "--range-type", "--baseline", "--fov", "--method", "--fill", "--smooth")
-_Shown = tuple[str, str, str, list[str] | None]  # what was said, the surfaces, the expected errors, and the files
-_PAIR = ("--rgb", "--depth", "--camera", "--mask")
+_Shown = tuple[str, str, list[str] | None]  # what was said, the surfaces, and the files
 
 
 def browse(request: BrowserRequest, console: Console) -> list[str]:
@@ -98,17 +95,12 @@ class Work:
         self.request, self._folder = request, folder
         self.process: subprocess.Popen[bytes] | None = None
 
-    def compute(self, *given: Any) -> Iterator[_Shown]:
-        """Upsample a photo's depth map, or a frame of a capture; yield what to show.
-
-        Given are the paths of a capture, a photo, a depth map, a camera and a mask, the number of the capture's frame
-        from 1, and the values of ``_CHOICES``; empty or None for what is missing.
-        """
-        capture, frame, pair = given[0], given[5], dict(zip(_PAIR, given[1:5], strict=True))
-        if bool(capture) == bool(pair["--rgb"] and pair["--depth"]):
+    def compute(self, capture: str | None, frame: int, options: Mapping[str, str | None]) -> Iterator[_Shown]:
+        """Upsample a photo's depth map, or a frame of a capture, numbered from 1; yield what to show."""
+        given = {flag: value for flag, value in options.items() if value}
+        if bool(capture) == ({"--rgb", "--depth"} <= given.keys()):
             raise ValueError("expected a photo and a depth map, or a capture")
-        options = {**pair, **dict(zip(_CHOICES, given[6:], strict=True))}
-        arguments = [f"{flag}={value}" for flag, value in options.items() if value not in (None, "")]
+        arguments = [f"{flag}={value}" for flag, value in given.items()]
         with TemporaryDirectory(dir=self._folder) as place:
             result = Path(place) / "dsr-result"
             upsample = "upsample", f"--output={result.name}"
@@ -126,7 +118,7 @@ class Work:
             surfaces = f'<iframe title="the surfaces" sandbox="allow-scripts" srcdoc="{page}"></iframe>'
             archive = shutil.make_archive(str(result), "zip", place, result.name)
             meshes = [str(path) for path in sorted(result.rglob("mesh.*"))]
-            yield text, surfaces, _expected_errors(result), [archive, *meshes]
+            yield text, surfaces, [archive, *meshes]
 
     def stop(self) -> None:
         """End the process that is running."""
@@ -160,7 +152,7 @@ class Work:
                 resource.prlimit(process.pid, resource.RLIMIT_DATA, (memory, memory))
                 resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (_LARGEST_FILE, _LARGEST_FILE))
             while process.poll() is None:
-                yield before + self._said(place), "", "", None
+                yield before + self._said(place), "", None
                 if time.monotonic() > end:
                     limit = self.request.max_seconds
                     raise ValueError(f"it took more than {limit:g} s (--max-seconds), and was ended")
@@ -178,22 +170,6 @@ class Work:
         """Return what a command has said so far, without the folders of uploads and results."""
         text = (place / "said.txt").read_text(encoding="utf-8", errors="replace")
         return re.sub(rf"{re.escape(str(self._folder))}{os.sep}(uploads{os.sep})?[^{os.sep}\s]+{os.sep}", "", text)
-
-
-def _expected_errors(result: Path) -> str:
-    """Return a table of the expected errors of a result, in Markdown; nothing for a method that predicts none."""
-    path = next(result.rglob("confidence.npz"), None)
-    if path is None:
-        return ""
-    with np.load(path) as errors:
-        depth, angle = (
-            np.nanpercentile(errors[f"{name}_error"].astype(np.float32), (50, 90)) for name in ("depth", "angle")
-        )
-    return (
-        "| expected error | median | 90 % below |\n| --- | --- | --- |\n"
-        f"| depth | {show_length(depth[0], 2)} | {show_length(depth[1], 2)} |\n"
-        f"| normals | {angle[0]:.1f} degrees | {angle[1]:.1f} degrees |"
-    )
 
 
 def make_app(work: Work, path: str) -> Any:
@@ -224,12 +200,12 @@ def make_page(work: Work) -> Any:
     def file(label: str, *suffixes: str) -> gr.File:
         return gr.File(label=label, file_types=list(suffixes), height=120)
 
-    def compute(*given: Any) -> Iterator[Any]:
+    def compute(capture: str | None, frame: int, *given: str | None) -> Iterator[Any]:
         try:
-            yield from work.compute(*given)
+            yield from work.compute(capture, frame, dict(zip(options, given, strict=True)))
         except (ValueError, OSError) as error:
             gr.Warning(html.escape(str(error)), duration=None)
-            yield f"error: {error}", "", "", None
+            yield f"error: {error}", "", None
 
     ranges = ["orthogonal", "perspective", "disparity"]
     with gr.Blocks(title="dsr app", analytics_enabled=False, delete_cache=(_KEPT // 4, _KEPT), fill_width=True) as page:
@@ -257,8 +233,12 @@ def make_page(work: Work) -> Any:
                     cancel = gr.Button("Cancel", min_width=100)
                 said = gr.Textbox(label="What was read and done", lines=6, max_lines=20, interactive=False)
             with gr.Column(scale=3, min_width=320):
-                shown = gr.HTML(), gr.Markdown(), gr.File(label="Results", interactive=False, height=140)
-        given = [capture, photo, depth, camera, mask, frame, unit, range_type, baseline, fov, method, fill, smooth]
+                shown = gr.HTML(), gr.File(label="Results", interactive=False, height=140)
+        options = {
+            "--rgb": photo, "--depth": depth, "--camera": camera, "--mask": mask, "--depth-unit": unit, "--fov": fov,
+            "--range-type": range_type, "--baseline": baseline, "--method": method, "--fill": fill, "--smooth": smooth,
+        }  # fmt: skip
+        given = [capture, frame, *options.values()]
         computing = go.click(compute, given, [said, *shown], concurrency_limit=1, api_visibility="private")
         cancel.click(None, cancels=computing)
     return page

@@ -6,6 +6,7 @@ job begins if one of its jobs cannot be run, with a line for each of these.
 """
 
 import copy
+import functools
 import importlib
 import os
 import re
@@ -45,16 +46,6 @@ from dsr.utils.files import FullDiskError
 from dsr.utils.guards import OutOfMemoryError, did_you_mean, refusing_excess
 
 
-def run_eval(arguments: Sequence[str] | None = None) -> None:
-    """Run ``eval.py``, which is ``dsr eval``, with the given arguments or those of the process."""
-    run_command("eval", lambda config: module_of("eval", config).evaluate(config), arguments)
-
-
-def run_train(arguments: Sequence[str] | None = None) -> None:
-    """Run ``train.py``, which is ``dsr train``, with the given arguments or those of the process."""
-    run_command("train", lambda config: module_of("train", config).train(config), arguments)
-
-
 def module_of(name: str, config: DictConfig) -> Any:
     """Check the configuration of ``train`` or ``eval``, and return the module of the command, which imports torch."""
     kind, module = (TrainConfig, "train") if name == "train" else (EvalConfig, "evaluate")
@@ -88,6 +79,11 @@ def run_command(name: str, command: Callable[[DictConfig], Any], arguments: Sequ
         fail(_damaged_file() or f"{' '.join(sys.argv[1:])}: {one_line(error)}")  # of Hydra's, which names no key
     finally:
         sys.argv = process
+
+
+# ``eval.py``, which is ``dsr eval``, and ``train.py``, with the arguments that they get or those of the process
+run_eval = functools.partial(run_command, "eval", lambda config: module_of("eval", config).evaluate(config))
+run_train = functools.partial(run_command, "train", lambda config: module_of("train", config).train(config))
 
 
 def _job(command: Callable[[DictConfig], Any], argv: list[str], begun: list[DictConfig]) -> Callable[[DictConfig], Any]:

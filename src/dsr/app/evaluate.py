@@ -10,7 +10,8 @@ import math
 import random
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
@@ -66,11 +67,12 @@ from dsr.utils.console import ConsoleProgress, note_once, one_line, open_console
 from dsr.utils.guards import free_memory
 from dsr.utils.processes import Pool, computing_threads, free_first
 from dsr.utils.progress import SILENT, Progress
-from dsr.utils.ratios import NATIVE, match_ratio
+from dsr.utils.ratios import NATIVE, match_ratio, round_ratio
 from dsr.utils.versions import hash_once
 
 _OBJECTIVE = "RMSE_v"
 _MEMORY = 1 << 30  # bytes of free memory that the automatic number of workers leaves to each
+_BESIDE = 3  # scenes of a GPU: one is predicted while others are read, written and scored
 _WORTH_WORKERS = 30.0  # seconds of work from which workers are started, which take some to begin
 
 
@@ -283,6 +285,7 @@ def _run(prepared: _Prepared, method: Method, progress: ConsoleProgress) -> pd.D
         _seed(settings.seed)
         prepare_scenes(source, source.scenes(), progress)
         study = _study(prepared, method)
+        progress.say(f"method {study.label} x{round_ratio(study.scale)}, {settings.precision} on {prepared.device}")
         for remark in method.remarks(source.name, source.scenes(), study.scale):
             note_once(remark)
         results = _evaluate_scenes(prepared, study, progress)
@@ -303,7 +306,19 @@ def _evaluate_scenes(prepared: _Prepared, study: Evaluation, progress: Progress)
     since = time.time() if settings.overwrite else -math.inf
     found: dict[str, SceneResult] = {}
     left, begun = list(scenes), time.monotonic()
-    if workers == 1 or settings.workers == "auto":
+    if prepared.device.type != "cpu" and not prepared.selected.recipe.abilities.optimises:
+        with ThreadPoolExecutor(_BESIDE) as pool:
+
+            def results_of(function: Callable[..., Any], items: Sequence[str]) -> Iterator[tuple[str, Any]]:
+                return zip(items, pool.map(functools.partial(function, study), items), strict=True)
+
+            results = _in_workers(results_of, left, since)
+            try:
+                found.update(progress.track(results, "evaluate", len(scenes), label=itemgetter(0)))
+            except BaseException:  # what has begun is completed
+                pool.shutdown(cancel_futures=True)
+                raise
+    elif workers == 1 or settings.workers == "auto":
         with computing_threads(threads):
             for scene in progress.track(free_first(study.folder, scenes), "evaluate", len(scenes)):
                 found[scene] = evaluate_scene(study, scene, since, progress)
@@ -312,18 +327,21 @@ def _evaluate_scenes(prepared: _Prepared, study: Evaluation, progress: Progress)
                 if workers > 1 and needed > _WORTH_WORKERS:
                     break
     if left:
-        with Pool(min(workers, len(left)), _begin, (prepared, since), threads, progress.say) as pool:
-            results = _in_workers(pool, left)
+        with Pool(min(workers, len(left)), _begin, (prepared,), threads, progress.say) as pool:
+            results = _in_workers(pool.results, left, since)
             for scene, result in progress.track(results, "evaluate", len(scenes), done=len(found), label=itemgetter(0)):
                 found[scene] = result
     return {scene: found[scene] for scene in scenes}
 
 
-def _in_workers(pool: Pool, left: list[str]) -> Iterator[tuple[str, SceneResult]]:
+def _in_workers(
+    results_of: Callable[..., Iterable[tuple[str, SceneResult | None]]], left: list[str], since: float
+) -> Iterator[tuple[str, SceneResult]]:
     """Yield the scenes with their results; those that other commands work on come last."""
     try:
         for wait in (False, True):
-            for scene, result in pool.results(functools.partial(_in_worker, wait), tuple(left)):
+            evaluate_one = functools.partial(_in_worker, wait=wait, since=since)
+            for scene, result in results_of(evaluate_one, tuple(left)):
                 if result is not None:
                     left.remove(scene)
                     yield scene, result
@@ -331,21 +349,15 @@ def _in_workers(pool: Pool, left: list[str]) -> Iterator[tuple[str, SceneResult]
         yield from ((scene, SceneResult(failure=f"{scene}: {error}")) for scene in left)
 
 
-_worker: tuple[Evaluation, float] | None = None  # of this process, if it is a worker
-
-
-def _begin(prepared: _Prepared, since: float) -> None:
+def _begin(prepared: _Prepared) -> Evaluation:
     """Prepare a worker, which repeats no note of its parent."""
-    global _worker  # noqa: PLW0603 - the process's own
     _seed(prepared.settings.seed)
     with contextlib.redirect_stderr(io.StringIO()):
-        _worker = _study(prepared, _method(prepared, SILENT)), since
+        return _study(prepared, _method(prepared, SILENT))
 
 
-def _in_worker(wait: bool, scene: str) -> SceneResult | None:
+def _in_worker(study: Evaluation, scene: str, *, wait: bool, since: float) -> SceneResult | None:
     """Evaluate a scene in a worker; None if another process works on it, unless its end is waited for."""
-    assert _worker is not None  # noqa: S101 - workers begin with _begin
-    study, since = _worker
     for _ in free_first(study.folder, [scene], wait=wait):
         return evaluate_scene(study, scene, since)
     return None

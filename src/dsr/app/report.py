@@ -1,4 +1,4 @@
-"""The command behind ``dsr report``."""
+"""The commands behind ``dsr report``, ``dsr leaderboard`` and ``dsr study``."""
 
 import json
 import os
@@ -7,22 +7,23 @@ from pathlib import Path
 import pandas as pd
 from rich.console import Console
 
-from dsr.app.requests import REPORT_PARTS, LeaderboardRequest, ReportRequest
+from dsr.app.requests import REPORT_PARTS, AnswersRequest, LeaderboardRequest, ReportRequest, StudyRequest
 from dsr.evaluation.run_files import load_results
 from dsr.notes import expect_no_warning
 from dsr.report.correlations import save_scatter_matrix, write_correlations
 from dsr.report.figures import Figures
 from dsr.report.page import Pictures, save_page
-from dsr.report.study.percentages import read_study
+from dsr.report.study.files import KEY_NAME, files_of, read_all, read_key
+from dsr.report.study.percentages import collect, read_study, remarks, tables_of
+from dsr.report.study.questionnaire import build_study
 from dsr.report.table_layouts import write_tables
 from dsr.report.worker_pool import WorkerPool
 from dsr.utils.console import ConsoleProgress, show
-from dsr.utils.files import replacing_folder, write_text
+from dsr.utils.files import expect_target, replacing_folder, write_text
 from dsr.utils.progress import Progress
 from dsr.utils.ratios import as_ratio
 
-_MARK = "report.json"
-"""A file that marks a directory as a report, which a new one may replace."""
+_MARK = "report.json"  # a file that marks a directory as a report, which a new one may replace
 _FEW = 24  # predictions below which the start of worker processes takes longer than they save
 _MOST = 8  # workers unless more are requested; each needs about 0.5 GB
 _MAIN = {
@@ -109,3 +110,45 @@ def _write(
                     leaderboard=request.leaderboard,
                 )
     return list(dict.fromkeys(notes))
+
+
+def build_page(request: StudyRequest, console: Console) -> list[str]:
+    """Make the page and its key."""
+    progress, results = ConsoleProgress(console), load_results(request.runs)
+    if request.strict:
+        expect_no_warning(", ".join(map(str, request.runs)), results.warnings)
+    built = build_study(results, request.output, request.choice, progress, overwrite=request.overwrite)
+    for warning in results.warnings:
+        show(console, str(warning))
+    for note in built.notes:
+        show(console, note)
+    key = built.key
+    labels = dict.fromkeys(each.label for trial in key.trials.values() for each in trial.candidates.values())
+    count, size = len(key.trials), built.page.stat().st_size / 1e6
+    show(console, f"study {key.study}: {count} scenes under {key.light}; {', '.join(labels)}")
+    questions = key.scenes_per_person + key.repeat
+    show(console, f"{built.page}  {size:.1f} MB, {questions} questions for each person; give people only this file")
+    show(console, f"{request.output / 'key.json'}  which method made which picture; keep it to yourself")
+    return []
+
+
+def collect_answers(request: AnswersRequest, console: Console) -> list[str]:
+    """Read answers, print and write the table."""
+    path = request.output or request.study / "study.csv"
+    expect_target(path)
+    key = read_key(request.study / KEY_NAME)
+    files = files_of(request.answers)
+    answers, left_out = read_all(files, key)
+    errors = Console(stderr=True)
+    for line in left_out:
+        show(errors, f"left out: {line}")
+    if not answers:
+        raise ValueError(f"{request.study}: expected answers that count, got none in {len(files)} files")
+    table = collect(answers, key)
+    for each in tables_of(table):
+        console.print(each)
+    for line in remarks(answers, key):
+        show(console, line)
+    write_text(path, table.to_csv(index=False, float_format="%.6g"))
+    show(console, f"{path}  {len(answers)} of {len(files)} files count{', see above' if left_out else ''}")
+    return []

@@ -14,8 +14,6 @@ from dsr.utils.options import Options, Rule, at_least, group, one_of, option, po
 
 SHELLS = ("bash", "zsh", "fish")
 REPORT_PARTS = ("tables", "metrics", "figures", "page")
-_MOST_WORKERS = 256
-_LAST_PORT = 65535
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +62,7 @@ class ReportRequest(RunsRequest):
         None,
         "processes that draw and encode (default: one per core, at most 8)",
         "N",
-        rule=Rule(f"1..{_MOST_WORKERS}", lambda count: 1 <= count <= _MOST_WORKERS),
+        rule=Rule("1..256", lambda count: 1 <= count <= 256),
     )
 
 
@@ -134,10 +132,7 @@ class BrowserRequest(Options):
     """
 
     port: int = option(
-        8765,
-        "of this machine; 0: a free one (8765)",
-        "PORT",
-        rule=Rule("0..65535", lambda port: 0 <= port <= _LAST_PORT),
+        8765, "of this machine; 0: a free one (8765)", "PORT", rule=Rule("0..65535", lambda port: 0 <= port <= 65535)
     )
     open_page: bool = option(True, "only serve the page", flags="--no-open")
     max_upload: float = option(

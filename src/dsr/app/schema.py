@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 from dsr.utils.configuration import ConfigError, build, config_directories
 from dsr.utils.console import note_once
 from dsr.utils.files import data_root
-from dsr.utils.guards import did_you_mean, is_number
+from dsr.utils.guards import did_you_mean, expect_one_of, is_number
 from dsr.utils.ratios import NATIVE, SCALES
 
 Config = Mapping[str, Any]  # a composed configuration as plain values
@@ -55,11 +55,6 @@ def expect_name(key: str, name: str) -> None:
     leads = name in ("", ".", "..") or {*"/\\"} & {*name} or not name.isprintable()
     if leads or len(name) > _LONGEST_NAME:
         raise ConfigError(f"{key}: expected a name without folders, got {name[:60]!r}")
-
-
-def _expect_one_of(key: str, value: object, choices: tuple[Any, ...], hint: str = "") -> None:
-    if value not in choices:
-        raise ConfigError(f"{key}: expected one of {', '.join(map(str, choices))}, got {value!r:.60}{hint}")
 
 
 def _is_count(value: object, most: float = math.inf) -> bool:
@@ -103,7 +98,10 @@ class RunConfig:
         parts: dict[str, Any] = {each.name: each.default_factory for each in fields(cls)}
         settings = cls(**{key: parts[key](**value) if is_dataclass(parts[key]) else value
                           for key, value in values.items()})  # fmt: skip
-        settings.check()
+        try:
+            settings.check()
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
         return settings
 
     def build(self, group: str) -> Any:
@@ -115,7 +113,7 @@ class RunConfig:
         """Check values beyond their types."""
         for group, name in self.names.items():
             expect_name(f"names.{group}", str(name))
-        _expect_one_of("precision", self.precision, ("float32", "tf32", "bfloat16", "auto"))
+        expect_one_of("precision", self.precision, ("float32", "tf32", "bfloat16", "auto"))
         if self.seed < 0:
             raise ConfigError(f"seed: expected 0 or a positive number, got {self.seed}")
 
@@ -147,7 +145,7 @@ class EvalConfig(RunConfig):
             if value != "auto" and not _is_count(value, _MOST):
                 raise ConfigError(f"{name}: expected auto or a whole number from 1 to {_MOST}, got {value!r}")
         if not self.measured:
-            _expect_one_of("scale", self.scale, SCALES, "; downsampling=measured takes a sensor's map of any ratio")
+            expect_one_of("scale", self.scale, SCALES, "; downsampling=measured takes a sensor's map of any ratio")
         elif self.scale != NATIVE and not (is_number(self.scale) and self.scale >= 1):
             expected = f"{NATIVE} or the ratio of the measured maps, 1 or more"
             raise ConfigError(f"scale: expected {expected}, got {self.scale!r}")
@@ -192,11 +190,11 @@ class TrainConfig(RunConfig):
     def check(self) -> None:
         """Check values beyond their types, of the trainer without Lightning, which takes seconds to import."""
         super().check()
-        _expect_one_of("scale", self.scale, SCALES)
+        expect_one_of("scale", self.scale, SCALES)
         if "net" not in self.model:
             raise ConfigError("model: missing; give it as model=...")
-        _expect_one_of("loss.visual", self.loss.visual, ("mse_v", "dssim", "lpips"))
-        _expect_one_of("keep", self.keep, ("best", "last"))
+        expect_one_of("loss.visual", self.loss.visual, ("mse_v", "dssim", "lpips"))
+        expect_one_of("keep", self.keep, ("best", "last"))
         w = self.loss.w
         if w != "auto" and (not is_number(w) or w < 0):
             raise ConfigError(f"loss.w: expected auto or a number, 0 or more, got {w!r}")
@@ -206,11 +204,11 @@ class TrainConfig(RunConfig):
         if isinstance(self.trainer.get("profiler"), str):
             raise ConfigError("trainer.profiler: expected a node with _target_, dirpath and filename")
         trainer = self.trainer = {**READ_OF_TRAINER, **self.trainer}
-        _expect_one_of("trainer.strategy", trainer["strategy"], ("auto", "ddp"))
+        expect_one_of("trainer.strategy", trainer["strategy"], ("auto", "ddp"))
         for name in ("max_steps", "val_check_interval", "accumulate_grad_batches", "devices"):
             if not _is_count(trainer[name]) and (name, trainer[name]) != ("devices", "auto"):
                 raise ConfigError(f"trainer.{name}: expected a whole number, 1 or more, got {trainer[name]!r:.60}")
-        _expect_one_of("trainer.compile", trainer["compile"], (True, False))
+        expect_one_of("trainer.compile", trainer["compile"], (True, False))
         clip = trainer["gradient_clip_val"]
         if clip is not None and not (is_number(clip) and clip > 0):
             raise ConfigError(f"trainer.gradient_clip_val: expected a positive number or null, got {clip!r:.60}")

@@ -5,6 +5,7 @@ import fnmatch
 import functools
 import math
 import os
+import re
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
@@ -62,7 +63,7 @@ from dsr.utils.checkpoints import (
 )
 from dsr.utils.compute_device import fast_precision, pick_device
 from dsr.utils.configuration import ConfigError, build, expect_library
-from dsr.utils.console import USAGE_ERROR, ConsoleProgress, one_line, without_credentials
+from dsr.utils.console import USAGE_ERROR, ConsoleProgress, one_line
 from dsr.utils.files import replacing
 from dsr.utils.guards import did_you_mean
 from dsr.utils.runs_table import list_run
@@ -71,6 +72,7 @@ MONITOR = "val/RMSE_v"
 _LARGEST_SEED = 2**32 - 1
 _LAST = Path("checkpoints", "last.ckpt")  # which a training goes on from, in the directory of its run
 _OF_PROCESSES = ("LOCAL_RANK", "NODE_RANK", "MASTER_ADDR", "MASTER_PORT", "WORLD_SIZE")  # which Lightning sets
+_CREDENTIALS = re.compile(r"[A-Za-z][\w+.-]*://([^\s/]*|\S*:\S*)@")  # before the host of an address
 _RESUMABLE = ("resume", "device", "trust")  # keys that may stand beside resume=
 
 
@@ -200,7 +202,7 @@ class _Training:
             if name in ("wandb", "mlflow"):  # an extra of that name installs the library
                 expect_library(f"logger={name}", name, name)
             for key, value in node.items():  # of which the run's config.yaml keeps each
-                if isinstance(value, str) and without_credentials(value) != value:
+                if isinstance(value, str) and _CREDENTIALS.search(value):
                     what = "an address without name and password, which the service reads from the environment"
                     raise ConfigError(f"logger.{name}.{key}: expected {what}")
             with without_chatter():

@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from dsr.app.run_directory import IMPORTED, entries_of, imported
 from dsr.app.schema import Config, TrainConfig, expect_name, user_directories
-from dsr.data.scene_source import SceneSource, SceneSubset
+from dsr.data.scene_source import SceneSource, subset
 from dsr.degradation.downsampling import Downsampling
 from dsr.methods.networks.network import DisparityNetwork
 from dsr.training.data_module import Part, PatchData
@@ -168,7 +168,7 @@ def studies_of_run(plain: Config, given: Sequence[str]) -> Iterator[tuple[dict[s
         several = len(data.held_out) > 1 and base["output_dir"] is not None
         place = {"output_dir": str(Path(base["output_dir"]) / kind)} if several else {}
         there = {"names": {**names, "dataset": kind}, "dataset": {"validation_of": str(folder)}}
-        yield {**base, **place, **there}, SceneSubset(source, scenes)
+        yield {**base, **place, **there}, subset(source, scenes)
 
 
 def training_data(settings: TrainConfig, devices: int = 1, device: torch.device | str = "cpu") -> PatchData:

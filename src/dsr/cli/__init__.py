@@ -16,7 +16,7 @@ from dsr.app import requests
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.doctor import version_lines
 from dsr.utils import interruption
-from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, printable, show
+from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, show
 from dsr.utils.files import FullDiskError
 from dsr.utils.guards import did_you_mean, refusing_excess
 from dsr.utils.options import Options, add_options, build
@@ -62,10 +62,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 class Parser(argparse.ArgumentParser):
     """A parser, and those of its commands, which says what may be meant."""
-
-    def error(self, message: str) -> NoReturn:
-        """Exit with the usage and the error, which repeats arguments, without an address's password."""
-        super().error(printable(message))
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse; an unknown option is reported before what is missing, which it may stand for."""
@@ -244,7 +240,7 @@ examples:
 
 Open site/index.html in a browser, or publish the folder as it is.
 """),
-    Command("study build", requests.StudyRequest, "dsr.cli.tasks:build_page", """\
+    Command("study build", requests.StudyRequest, "dsr.app.report:build_page", """\
 examples:
   dsr study build outputs/eval -o study
   dsr study build outputs/eval --scale 4 --methods bicubic msg_v facets --repeat 2 -o study
@@ -252,7 +248,7 @@ examples:
 
 Give people only index.html: key.json says which method made which picture.
 """),
-    Command("study collect", requests.AnswersRequest, "dsr.cli.tasks:collect_answers", """\
+    Command("study collect", requests.AnswersRequest, "dsr.app.report:collect_answers", """\
 Join the table to a report: dsr report RUNS --study study/study.csv
 """),
     Command("data list", requests.DataListRequest, "dsr.cli.data_tasks:list_data_sets"),
@@ -268,7 +264,7 @@ examples:
   dsr doctor                     whether everything is here that dsr needs: exit code 0, or 2
   dsr doctor my_scenes           units, cameras, holes: exit code 0, or 1 where something is probably wrong
 """),
-    Command("export", requests.ExportRequest, "dsr.cli.tasks:export_onnx", """\
+    Command("export", requests.ExportRequest, "dsr.cli.export:export_onnx", """\
 examples:
   dsr export --onnx facets_x4.onnx
   dsr export --onnx facets_x1.onnx --scale 1               for depth maps of the photo's own size

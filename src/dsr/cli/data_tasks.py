@@ -4,7 +4,7 @@ import contextlib
 import sys
 import textwrap
 from collections.abc import Mapping
-from importlib.metadata import PackageNotFoundError, metadata
+from importlib.metadata import metadata
 
 from rich.console import Console
 from rich.prompt import Confirm
@@ -35,10 +35,7 @@ def downloads() -> Mapping[str, Collection]:
     names = weights.left_out()
     if not names:
         return CATALOGUE
-    try:
-        stated = metadata(DISTRIBUTION).get_all("Project-URL") or []
-    except PackageNotFoundError:
-        stated = []
+    stated = metadata(DISTRIBUTION).get_all("Project-URL") or []
     address = dict(each.split(", ", 1) for each in stated).get(_URL, "").rstrip("/")
     items = (
         Item(

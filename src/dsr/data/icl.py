@@ -15,7 +15,6 @@ All are 640 x 480 of one camera, 481.20, -480.00, 319.50, 239.50.
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 
 from dsr.data.frame_files import expect_size, name_of, read_16bit, read_picture, to_depth, walk
 from dsr.data.scene_source import Preparation, PreparedDataset, SceneSelection, make_records, rename_frames
@@ -63,21 +62,11 @@ def load_frame(rgb_path: Path, depth_path: Path, dataset: str, name: str) -> Sce
     return Scene(dataset, name, rgb, CAMERA, depth)
 
 
-FRAMES = MappingProxyType(
-    {
-        "painting": "living_room_traj0/0300",
-        "sofa": "living_room_traj1/0300",
-        "plant": "living_room_traj2/0300",
-        "office": "office_room_traj0/0300",
-        "coat_rack": "office_room_traj1/0300",
-        "displays": "office_room_traj2/0300",
-    }
-)
 DETECTED = ((find_frames, load_frame, "icl"),)
 
 
 class ICL(PreparedDataset):
-    """Frames of ICL-NUIM; ``frames`` says which frame each of the paper's names stands for."""
+    """Frames of ICL-NUIM; ``frames`` says which frame each of the paper's names stands for. None: all by their own."""
 
     def __init__(
         self,
@@ -85,7 +74,7 @@ class ICL(PreparedDataset):
         scenes: SceneSelection = None,
         size: int | None = 512,
         crop: float = 0.5,
-        frames: Mapping[str, str] = FRAMES,
+        frames: Mapping[str, str] | None = None,
     ) -> None:
-        found = make_records(rename_frames(find_frames(Path(root).expanduser()), frames), load_frame, "icl")
-        super().__init__("icl", root, found, scenes, tuple(FRAMES), Preparation(size, crop))
+        found = make_records(rename_frames(find_frames(Path(root).expanduser()), frames or {}), load_frame, "icl")
+        super().__init__("icl", root, found, scenes, tuple(frames) if frames else None, Preparation(size, crop))

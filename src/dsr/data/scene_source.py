@@ -5,6 +5,7 @@ a change of any of them prepares the scene again.
 """
 
 import contextlib
+import copy
 import functools
 import hashlib
 import json
@@ -83,21 +84,11 @@ def prepare_scenes(source: SceneSource, names: Sequence[str], progress: Progress
             pass
 
 
-class SceneSubset(SceneSource):
-    """Some of the scenes of a data set."""
-
-    def __init__(self, source: SceneSource, names: Sequence[str]) -> None:
-        self.name, self.evaluation = source.name, source.evaluation
-        self.regions, self.soft_edges = source.regions, source.soft_edges
-        self._source, self._scenes = source, names
-
-    def load(self, scene: str) -> Scene:
-        """Return one scene."""
-        return self._source.load(scene)
-
-    def fingerprint(self, scene: str) -> str:
-        """Return the fingerprint of the data set's scene."""
-        return self._source.fingerprint(scene)
+def subset(source: SceneSource, names: Sequence[str]) -> SceneSource:
+    """Return a data set of some of its scenes."""
+    part = copy.copy(source)
+    vars(part)["scenes"] = functools.partial(list, names)
+    return part
 
 
 def as_source(made: Any) -> SceneSource:

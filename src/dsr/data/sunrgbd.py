@@ -15,9 +15,6 @@ the principal point is uncertain by one pixel.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
-
-from torch import Tensor
 
 from dsr.data.frame_files import (
     expect_size,
@@ -50,11 +47,6 @@ def find_frames(root: Path) -> dict[str, tuple[Path]]:
     return in_natural_order(found)
 
 
-def read_depth(path: Path) -> Tensor:
-    """Return a depth picture, (1, H, W) float64 in metres, NaN in holes."""
-    return to_depth(path, turn_back_bits(str(path), read_16bit(path), SUNRGBD_BITS) / 1000)
-
-
 def load_frame(
     folder: Path, dataset: str, name: str, *, refined: bool = False, intrinsics: Intrinsics | None = None
 ) -> Scene:
@@ -74,7 +66,8 @@ def load_frame(
 
 def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str, intrinsics: Path | Intrinsics) -> Scene:
     """Return the scene of two files, wherever they lie, and of their intrinsics or the file that has them."""
-    rgb, depth = read_picture(rgb_path), read_depth(depth_path)
+    rgb = read_picture(rgb_path)
+    depth = to_depth(depth_path, turn_back_bits(str(depth_path), read_16bit(depth_path), SUNRGBD_BITS) / 1000)
     size = (rgb.shape[1], rgb.shape[2])
     expect_size(depth_path, depth, size)
     if isinstance(intrinsics, Path):
@@ -84,28 +77,16 @@ def load_pair(rgb_path: Path, depth_path: Path, dataset: str, name: str, intrins
     return Scene(dataset, name, rgb, camera, depth)
 
 
-# Folders of the scenes; where several scenes lie below one, its first is used
-FRAMES = MappingProxyType(
-    {
-        "kinect1_1": "kv1/NYUdata/NYU0001",
-        "kinect1_2": "kv1/NYUdata/NYU0428",
-        "kinect1_3": "kv1/b3dodata/img_0063",
-        "kinect2_1": "kv2/kinect2data/000002_2014-05-26_14-23-37_260595134347_rgbf000103-resize",
-        "kinect2_2": "kv2/align_kv2/2014-12-18_11-31-54_260595134347",
-        "kinect2_3": "kv2/align_kv2/2014-12-18_13-59-40_260595134347",
-        "realsense_1": "realsense/lg/2014_10_24-09_14_34-1311000073",
-        "realsense_2": "realsense/sa/2014_10_21-15_21_11-1311000073",
-        "realsense_3": "realsense/sh/2014_10_21-11_35_34-1311000041",
-        "xtion_1": "xtion/xtion_align_data/2014_12_18_12_3_40",
-        "xtion_2": "xtion/sun3ddata/mit_76_studyroom/76-1studyroom1/0000003-000000067032",
-        "xtion_3": "xtion/sun3ddata/brown_bm_2/brown_bm_2",
-    }
-)
 DETECTED = ((find_frames, load_frame, "sunrgbd"),)
 
 
 class SunRGBD(PreparedDataset):
-    """Scenes of SUN RGB-D; the true depth is what the sensor measured, with its holes, or the authors' refined one."""
+    """Scenes of SUN RGB-D; the true depth is what the sensor measured, with its holes, or the authors' refined one.
+
+    Args:
+        frames: the folder that each name stands for; where several scenes lie below one, its first. None: all folders.
+
+    """
 
     def __init__(
         self,
@@ -114,19 +95,18 @@ class SunRGBD(PreparedDataset):
         size: int | None = 512,
         crop: float = 0.5,
         refined: bool = False,
-        frames: Mapping[str, str] = FRAMES,
+        frames: Mapping[str, str] | None = None,
         intrinsics: Sequence[float] | None = None,
     ) -> None:
         if intrinsics is not None and len(intrinsics) != 4:
             raise ValueError(f"intrinsics: expected fx, fy, cx, cy, got {len(intrinsics)} numbers")
-
         all_frames = find_frames(Path(root).expanduser())
         places = {}
-        for name, path in frames.items():  # the first scene below a path, which may be below SUNRGBD
+        for name, path in (frames or {}).items():  # the first scene below a path, which may be below SUNRGBD
             beginnings = tuple(f"{above}{path}/".replace("/", "_") for above in ("", "SUNRGBD/"))
             below = (each for each in all_frames if f"{each}_".replace("/", "_").startswith(beginnings))
             places[name] = next(below, path)
         given = intrinsics and tuple(intrinsics)
         renamed = rename_frames(all_frames, places)
         found = make_records(renamed, load_frame, "sunrgbd", refined=refined, intrinsics=given)
-        super().__init__("sunrgbd", root, found, scenes, tuple(FRAMES), Preparation(size, crop))
+        super().__init__("sunrgbd", root, found, scenes, tuple(frames) if frames else None, Preparation(size, crop))

@@ -8,13 +8,14 @@ D435), where 28 to 65 % of an object's pixels are missing. Shapes are seen along
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.degradation.random_fields import chance, draw, field_of, normal, power, uniform
+from dsr.degradation.random_fields import chance, draw, field_of, integer, normal, power, uniform
 from dsr.sample import Scene
 
 # How often each kind of object is drawn
@@ -151,13 +152,14 @@ def _draw_pose(scene: Scene, depth: Tensor, radius: float, generator: torch.Gene
         down, across = (float(part.diff(dim=dim).nanmedian().nan_to_num(0)) for dim in (0, 1))  # by how much it grows
         if kind == "upright" and (standing := _standing(scene, (u, v), (inverse, down, across))) is not None:
             return standing
-        direction = math.sin(up), -math.cos(up)
-        pose = Pose(u, v, direction, pitch, -pitch / math.sqrt(1 - pitch**2), uniform(0.7, 0.98, generator) / inverse)
-    if kind == "lying" and pose is not None:
-        turn = uniform(-math.pi, math.pi, generator)
-        direction = math.sin(turn), -math.cos(turn)
-        slope = -scene.camera.fx * (across * direction[0] + down * direction[1]) / inverse
-        pose = Pose(u, v, direction, 0.3 * pitch, max(-1.5, min(slope, 1.5)), (1 - radius / scene.camera.fx) / inverse)
+        nearer = uniform(0.7, 0.98, generator)
+        if kind == "lying":
+            up = uniform(-math.pi, math.pi, generator)
+            slope = -scene.camera.fx * (across * math.sin(up) - down * math.cos(up)) / inverse
+            pitch, slope, nearer = 0.3 * pitch, max(-1.5, min(slope, 1.5)), 1 - radius / scene.camera.fx
+        else:
+            slope = -pitch / math.sqrt(1 - pitch**2)
+        pose = Pose(u, v, (math.sin(up), -math.cos(up)), pitch, slope, nearer / inverse)
     return pose
 
 
@@ -186,8 +188,8 @@ class _Room:
         self.mean = self._walls.mean(dim=(0, 2, 3))[:, None, None]
         self._lights = []
         places = mask.flatten().nonzero()[:, 0]
-        for _ in range(1 + int(torch.randint(3, (1,), generator=generator))):
-            place = places[int(torch.randint(len(places), (1,), generator=generator))]
+        for _ in range(integer(1, 3, generator)):
+            place = places[integer(0, len(places) - 1, generator)]
             middle = normals[:2].flatten(1)[:, place] + 0.05 * torch.randn(2, generator=generator)
             half = [power(-1.6, -0.65, generator) for _ in range(2)]
             colour = power(0.3, 1.45, generator) * (1 + 0.1 * torch.randn((3, 1, 1), generator=generator))
@@ -233,14 +235,18 @@ def _paint_clear(
     painted = torch.lerp(painted, room.walls(front * 1.5) * uniform(0.3, 1.7, generator), rim)
     bright = torch.zeros_like(facing)
     for normals, weight in ((front, 1.0), (back, 0.5)):
-        # the share of light that is reflected by the cosine of the angle of incidence (Schlick, 1994)
-        share = weight * (_REFLECTED + (1 - _REFLECTED) * (1 - normals[2].clamp(0, 1)) ** 5)
+        share = weight * _reflectance(normals, _REFLECTED)
         lights = share.clamp(max=0.15) * room.lights(normals)
         painted = painted * (1 - share) + share * room.walls(normals) + lights
         bright += lights.mean(dim=0)
     line = body.lines * uniform(0.1, 0.6, generator)
     painted = torch.lerp(painted, room.mean * uniform(0.3, 2, generator) + uniform(0, 0.15, generator), line)
     return painted.clamp(0, 1), (bright + 0.7 * rim + 0.5 * body.lines).clamp(0, 1)
+
+
+def _reflectance(normals: Tensor, least: float) -> Tensor:
+    """Return the share of light that a surface reflects by the cosine of the angle of incidence (Schlick, 1994)."""
+    return least + (1 - least) * (1 - normals[2].clamp(0, 1)) ** 5
 
 
 def _sample(rgb: Tensor, window: Body | Plate, right: Tensor, down: Tensor) -> Tensor:
@@ -289,7 +295,7 @@ def _paint_gloss(rgb: Tensor, body: Body, generator: torch.Generator) -> tuple[T
         lit = ((side / side.norm()).mul(body.front).sum(dim=0) * side[2].sign()).clamp(min=0)
         albedo = (uniform(0.05, 0.8, generator) + 0.15 * torch.randn((3, 1, 1), generator=generator)).clamp(0.02, 1)
         base, least = albedo * (0.3 + uniform(0.3, 0.9, generator) * lit), power(-1.4, -0.7, generator)
-    share = least + (1 - least) * (1 - body.front[2].clamp(0, 1)) ** 5  # Schlick's, as of clear objects
+    share = _reflectance(body.front, least)
     shine = shine * share.clamp(max=0.5)
     painted = base * (1 - 0.5 * share) + 0.5 * share * room.walls(body.front) + shine
     return painted.clamp(0, 1), shine.mean(dim=0).clamp(0, 1)
@@ -318,7 +324,7 @@ def _add_plate(state: _State, focal: float, kind: str, generator: torch.Generato
         tint = 1 - uniform(0, 0.2, generator) * torch.rand((3, 1, 1), generator=generator)
         painted = state.rgb[window] * tint * (1 - share) + share * reflected * uniform(0.7, 1.8, generator)
         glare = torch.zeros_like(plate.right)
-        for _ in range(int(torch.randint(3, (1,), generator=generator))):  # streaks of light
+        for _ in range(integer(0, 2, generator)):  # streaks of light
             angle, wide = uniform(-math.pi, math.pi, generator), power(-1.5, -0.4, generator) * max(plate.right.shape)
             across = math.cos(angle) * plate.right + math.sin(angle) * plate.down + 0.5 * wide * normal(generator)
             glare += power(-1.3, -0.2, generator) * torch.exp(-((across / wide) ** 4))
@@ -361,7 +367,7 @@ def draw_vessel(pose: Pose, radius: float, size: tuple[int, int], generator: tor
     for _ in range(2):  # round the corners
         padded = functional.pad(profile[None, None], (_REACH, _REACH), mode="replicate")
         profile = functional.avg_pool1d(padded, 2 * _REACH + 1, stride=1)[0, 0]
-    rings = [uniform(0.8, 0.97, generator) for _ in range(int(torch.randint(3, (1,), generator=generator)))]
+    rings = [uniform(0.8, 0.97, generator) for _ in range(integer(0, 2, generator))]
     return _revolve(radius * profile, aspect * radius, [0.0, 1.0, *rings], pose, size)
 
 
@@ -373,10 +379,7 @@ def ball(pose: Pose, radius: float, size: tuple[int, int]) -> Body | None:
 
 def _outline(kind: str, generator: torch.Generator) -> tuple[list[tuple[float, float]], float]:
     """Return heights and radii, as shares of the height and of the largest radius, and the height over that radius."""
-
-    def some(low: float, high: float) -> float:
-        return uniform(low, high, generator)
-
+    some = partial(uniform, generator=generator)
     if kind == "bottle":
         neck, shoulder = some(0.2, 0.55), some(0.5, 0.75)
         lip = neck + some(0, 0.1)

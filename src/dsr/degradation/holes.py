@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dsr.degradation.random_fields import chance, field_of, near_steps, uniform
+from dsr.degradation.random_fields import chance, field_of, integer, near_steps, uniform
 from dsr.geometry.camera import Camera
 
 # From (1, h, w) depth in metres, NaN where missing, to a (1, h, w) bool mask of the pixels to remove
@@ -97,7 +97,7 @@ def draw_holes(kind: str, values: Tensor, luma: Tensor, camera: Camera, generato
         side = -1 if chance(0.5, generator) else 1
         return Shadows(side * uniform(0.03, 0.2, generator))(values.reciprocal(), camera, generator)
     if kind == "steps":
-        reach = 1 + int(torch.randint(2, (1,), generator=generator))
+        reach = integer(1, 2, generator)
         return near_steps(values, reach) & (torch.rand(values.shape, generator=generator) < uniform(0.3, 1, generator))
     if kind == "dark":
         return dark(values, luma, generator)

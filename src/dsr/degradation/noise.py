@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.degradation.holes import dark, occluded
-from dsr.degradation.random_fields import chance, field_of, near_steps, power, uniform, waves_of
+from dsr.degradation.random_fields import chance, field_of, integer, near_steps, power, uniform, waves_of
 from dsr.geometry.camera import RangeType
 from dsr.geometry.hole_size import window_maxima
 from dsr.utils.guards import expect_positive
@@ -243,7 +243,7 @@ def _jitter(values: Tensor, strength: float, generator: torch.Generator) -> Tens
 def _count(disparity: Tensor, noise: Tensor, generator: torch.Generator, *, stereo: bool = False) -> Tensor:
     """Return disparity in pixels as matching windows finds it: drawn to whole pixels, in steps, and smoothed again."""
     steps = (0.0, 1 / 64, 1 / 32, 1 / 32) if stereo else (1 / 32, 1 / 16, 1 / 8, 1 / 8)
-    step = steps[int(torch.randint(4, (1,), generator=generator))]
+    step = steps[integer(0, 3, generator)]
     if step and chance(0.15 if stereo else 0.4, generator):  # noise so weak that a slanted wall becomes a stair
         noise = noise * (uniform(0.1, 0.6, generator) * step / noise.std().clamp(min=1e-9)).clamp(max=1)
     counted = disparity + noise
@@ -252,8 +252,8 @@ def _count(disparity: Tensor, noise: Tensor, generator: torch.Generator, *, ster
     if step:
         counted = (counted / step).round() * step
     if chance(0.3, generator):
-        size = 2 * int(torch.randint(1, 3, (1,), generator=generator)) + 1
-        counted = disparity + _means(counted - disparity, torch.ones_like(disparity), size)
+        size = 2 * integer(1, 2, generator) + 1
+        counted = disparity + _means(counted - disparity, size)
     return counted
 
 
@@ -268,11 +268,11 @@ def _flight(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
     depth = values.reciprocal()
     amplitude = (luma + 0.05) * values.square()
     if chance(0.6, generator):  # flying pixels on both sides of steps: depth, weighted by the light, is averaged
-        size = 3 + 2 * int(torch.randint(5, (1,), generator=generator))
-        mixed = _means(depth, amplitude, size)
+        size = 3 + 2 * integer(0, 4, generator)
+        mixed = _means(depth, size, amplitude)
         depth = torch.where(depth.isfinite() & (field_of(depth, 1, generator) > -0.5), mixed, depth)
     if chance(0.3, generator):  # enlarged by interpolation, or filtered
-        wide = _means(depth, torch.ones_like(depth), 3 + 2 * int(torch.randint(3, (1,), generator=generator)))
+        wide = _means(depth, 3 + 2 * integer(0, 2, generator))
         depth = torch.where(depth.isfinite(), wide, depth)
     exact = depth
     strength = power(-3.8, -2.5, generator) * depth ** uniform(1, 3, generator) / (luma + 0.05).sqrt()
@@ -303,9 +303,9 @@ def _flight(values: Tensor, luma: Tensor, generator: torch.Generator) -> Tensor:
     return noisy
 
 
-def _means(values: Tensor, weights: Tensor, size: int) -> Tensor:
-    """Return weighted means of windows, holes left out, (1, h, w)."""
-    weights = torch.where(values.isfinite(), weights, 0)
+def _means(values: Tensor, size: int, weights: Tensor | None = None) -> Tensor:
+    """Return means of windows, weighted if weights are given, holes left out, (1, h, w)."""
+    weights = torch.where(values.isfinite(), torch.ones_like(values) if weights is None else weights, 0)
     return _window_means(values.nan_to_num(0) * weights, size) / _window_means(weights, size).clamp(min=1e-9)
 
 
@@ -360,7 +360,7 @@ def _match(values: Tensor, luma: Tensor, length: float, generator: torch.Generat
     stereo_constant = float(pixels / middle)
     amplitude = min(max(power(-2.9, -1.8, generator) * pixels, 0.02), 0.4)
     flat = 0.3 + torch.exp(-(luma - _window_means(luma, 5)).abs() / 0.03)
-    reach = int(torch.randint(5, (1,), generator=generator))  # half the matching window
+    reach = integer(0, 4, generator)  # half the matching window
     seen = _fatten(values, reach, generator) if reach else values
     stretch = uniform(1, 1.6, generator)
     waves = waves_of(values, length, generator, stretch)
@@ -371,7 +371,7 @@ def _match(values: Tensor, luma: Tensor, length: float, generator: torch.Generat
         waves = waves + uniform(0, 0.4, generator) * field_of(values, (0.3, max(length / 3, 0.3)), generator)
     counted = _count(stereo_constant * seen, amplitude * (flat / flat.mean()) * waves, generator, stereo=True)
     if chance(0.35, generator):  # filters that do not stop at steps
-        counted = _means(counted, torch.ones_like(counted), 2 * int(torch.randint(1, 4, (1,), generator=generator)) + 1)
+        counted = _means(counted, 2 * integer(1, 3, generator) + 1)
     return _lose(counted, values, luma, stereo_constant, generator) / stereo_constant
 
 
@@ -404,7 +404,7 @@ def _lose(
 
 def _between(values: Tensor, most: int, generator: torch.Generator) -> Tensor:
     """Return the mask of pixels lost where two surfaces are seen, up to ``most`` pixels from steps, (1, h, w)."""
-    reach = int(torch.randint(1, most + 1, (1,), generator=generator))
+    reach = integer(1, most, generator)
     beside = window_maxima(near_steps(values, 1).to(values), reach) > 0
     return beside & (field_of(values, 1.5, generator) > uniform(-2, 1, generator))
 

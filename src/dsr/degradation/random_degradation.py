@@ -26,7 +26,7 @@ from dsr.degradation.downsampling import KERNELS, Downsampling, Hints, encode_fa
 from dsr.degradation.glass import add_glass
 from dsr.degradation.holes import HOLES, draw_holes
 from dsr.degradation.noise import NOISES
-from dsr.degradation.random_fields import chance, draw, field_of, normal, power, uniform
+from dsr.degradation.random_fields import chance, draw, field_of, integer, normal, power, uniform
 from dsr.geometry.camera import Camera
 from dsr.sample import CENTIMETRES, AllHolesError, DepthSample, Scene
 from dsr.utils.guards import derived, unchecked
@@ -221,7 +221,7 @@ def displace(values: Tensor, scale: int, generator: torch.Generator) -> Tensor:
 def round_values(values: Tensor, generator: torch.Generator) -> Tensor:
     """Round to millimetres of depth, or to 8 bits of disparity."""
     if chance(0.6, generator):
-        step = (0.001, 0.001, 0.002, 0.005)[int(torch.randint(4, (1,), generator=generator))]
+        step = (0.001, 0.001, 0.002, 0.005)[integer(0, 3, generator)]
         return ((values.reciprocal() / step).round() * step).clamp(min=step).reciprocal()
     top = float(values.nan_to_num(0).max()) * uniform(1, 1.3, generator)
     return ((values / top * 255).round() / 255 * top).clamp(min=top / 255)

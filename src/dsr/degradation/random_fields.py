@@ -26,6 +26,11 @@ def uniform(low: float, high: float, generator: torch.Generator) -> float:
     return low + (high - low) * float(torch.rand(1, generator=generator))
 
 
+def integer(low: int, high: int, generator: torch.Generator) -> int:
+    """Return a whole number from ``low`` to ``high``, both included."""
+    return int(torch.randint(low, high + 1, (1,), generator=generator))
+
+
 def power(low: float, high: float, generator: torch.Generator) -> float:
     """Return 10 to the power of a number from ``low`` to ``high``."""
     return 10 ** uniform(low, high, generator)

@@ -100,8 +100,19 @@ class Identified(NamedTuple):
     constant: float | None = None  # f B over the step of disparity that the map's values show, in metres, if any
 
     def least_error(self, depth: Tensor) -> Tensor:
-        """Return :func:`least_error`, in the mode of the sensor that the map's values show."""
-        return least_error(self.sensor, depth, self.constant)
+        """Return the least standard deviation of depth that the sensor can have, in metres, of any shape; 0 if unknown.
+
+        It is that of its disparity, z^2 noise / (f B), where no noise is less than the rounding to steps, or its spread
+        at that distance, if that is larger. Steps are those that the map's values show, else of the native width.
+        """
+        least, sensor = torch.zeros_like(depth), self.sensor
+        constant = self.constant or _counts(sensor)
+        if constant and sensor.step is not None:
+            steps = max((sensor.noise or 0.0) / sensor.step, 12**-0.5)
+            least = depth.square() * (steps / constant)
+        if sensor.spread is not None:
+            least = torch.maximum(least, _interpolate(depth, ((0.0, 0.0), *sensor.spread)))
+        return least
 
     def offset_error(self, depth: Tensor) -> Tensor | None:
         """Return the expected systematic error of depth in metres, half of its limit; None where no limit is known."""
@@ -158,22 +169,6 @@ def _mismatch(sensor: Sensor, constant: float, parts: tuple[float, ...] = _PARTS
     if not own:
         return 0.0
     return min(abs(constant / (part * own) - 1) for part in (parts if sensor.kind == "stereo" else parts[:1]))
-
-
-def least_error(sensor: Sensor, depth: Tensor, constant: float | None = None) -> Tensor:
-    """Return the least standard deviation of depth that a sensor can have, in metres, of any shape; 0 if not known.
-
-    It is that of its disparity, z^2 noise / (f B), where no noise is less than the rounding to steps, or its spread at
-    that distance, if that is larger. ``constant`` is f B over the step of disparity; None for that of its native width.
-    """
-    least = torch.zeros_like(depth)
-    constant = constant or _counts(sensor)
-    if constant and sensor.step is not None:
-        steps = max((sensor.noise or 0.0) / sensor.step, 12**-0.5)
-        least = depth.square() * (steps / constant)
-    if sensor.spread is not None:
-        least = torch.maximum(least, _interpolate(depth, ((0.0, 0.0), *sensor.spread)))
-    return least
 
 
 def _interpolate(depth: Tensor, points: _ByDistance) -> Tensor:

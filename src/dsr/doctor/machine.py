@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import platform
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -11,7 +10,6 @@ from pathlib import Path
 
 import torch
 from packaging.requirements import Requirement
-from packaging.specifiers import SpecifierSet
 from rich.text import Text
 
 from dsr.data.download import CATALOGUE
@@ -41,16 +39,13 @@ def examine_machine() -> int:
     return USAGE_ERROR
 
 
-def check_python() -> list[Finding]:
-    """Check the version of Python, and report those of dsr and its weights."""
+def check_dsr() -> list[Finding]:
+    """Check that dsr is installed, and report its version and those of Python, torch and the weights."""
     try:
-        needed = distribution(DISTRIBUTION).metadata["Requires-Python"]
+        distribution(DISTRIBUTION)
     except PackageNotFoundError:
         return [Finding("dsr", "warning", "not installed, its sources are used", "pip install -e . in its folder")]
-    if SpecifierSet(needed).contains(platform.python_version(), prereleases=True):
-        return [Finding("dsr", "ok", line) for line in version_lines()[:2]]
-    message = f"Python {platform.python_version()}, not {needed}"
-    return [Finding("python", "problem", message, f"install Python {needed}, and dsr in it")]
+    return [Finding("dsr", "ok", line) for line in version_lines()[:2]]
 
 
 def check_packages() -> list[Finding]:
@@ -170,6 +165,6 @@ def lack(requirement: Requirement) -> str | None:
 
 
 CHECKS: tuple[Callable[[], list[Finding]], ...] = (
-    check_python, check_packages, check_weights, check_opencv, check_device, check_folders, check_extras,
+    check_dsr, check_packages, check_weights, check_opencv, check_device, check_folders, check_extras,
 )  # fmt: skip
 """A ``problem`` of these affects ``dsr upsample``, a ``note`` does not."""

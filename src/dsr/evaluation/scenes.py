@@ -10,6 +10,7 @@ stored config equals the requested one is reused, so that an interrupted run con
 import json
 import math
 import re
+import threading
 import time
 import zlib
 from collections.abc import Callable, Mapping
@@ -67,6 +68,7 @@ class Evaluation:
     alignment: str = "none"  # of each prediction before it is scored and drawn
     label: str = ""  # name in tables; empty for ``method_name``
     illustrate: Illustrate = lambda *_: None
+    turns: threading.Lock = field(default_factory=threading.Lock)  # for predictions of one at a time
 
     def sample(self, scene: str) -> DepthSample:
         """Return the method's input for a scene; a ValueError if a file of the scene is invalid."""
@@ -146,18 +148,18 @@ def _stored_seconds(path: Path, config: Mapping[str, Any]) -> float:
 def _predict(study: Evaluation, scene: str, config: Mapping[str, Any], progress: Progress) -> float:
     """Compute one prediction; write it, its sample and the iteration's history; return the method's seconds."""
     sample = study.sample(scene)
-    start = time.perf_counter()
-    with progress.task("steps") as step:
+    with study.turns, progress.task("steps") as step:
+        start = time.perf_counter()
         surface = study.method.surface(sample, step)
-    seconds = time.perf_counter() - start
+        seconds, history = time.perf_counter() - start, study.method.history
     depth = surface.depth
     expected = (1, sample.camera.height, sample.camera.width)
     if tuple(depth.shape) != expected:
         raise ValueError(f"{scene}: {study.method_name} gave depth of shape {tuple(depth.shape)}, expected {expected}")
     expect_some_depth(depth, f"{scene}: {study.method_name}")
-    if study.method.history is not None:
+    if history is not None:
         with replacing(path_within(study.folder, scene, f"{study.folder}: scene", "iterations/{}.csv")) as temporary:
-            pd.DataFrame(study.method.history).to_csv(temporary, index=False)
+            pd.DataFrame(history).to_csv(temporary, index=False)
     sample.save(sample_path(study.folder, scene))
     with replacing(prediction_path(study.folder, scene)) as temporary:
         np.savez_compressed(

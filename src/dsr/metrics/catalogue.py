@@ -51,21 +51,23 @@ METRICS: tuple[Metric, ...] = (
 )
 
 
-def _family(name: str, metrics: Sequence[Metric]) -> tuple[Metric, ...]:
-    return tuple(replace(metric, format=replace(metric.format, family=name)) for metric in metrics)
-
-
+_FAMILIES: Mapping[str, Sequence[Metric]] = {  # each with a table of its own
+    "depth": depth.DEPTH,
+    "normals": depth.NORMALS,
+    "points": depth.POINTS,
+    "evalmde": evalmde.METRICS,
+    "boundaries": boundaries.METRICS,
+    "calibration": calibration.METRICS,
+    "plane": sensor.PLANE,
+}
 PROTOCOLS: Mapping[str, tuple[Metric, ...]] = {
     "paper": METRICS,
     "field": depth.FIELD,
     "sensor": sensor.SENSOR,
-    "depth": _family("depth", depth.DEPTH),
-    "normals": _family("normals", depth.NORMALS),
-    "points": _family("points", depth.POINTS),
-    "evalmde": _family("evalmde", evalmde.METRICS),
-    "boundaries": _family("boundaries", boundaries.METRICS),
-    "calibration": _family("calibration", calibration.METRICS),
-    "plane": _family("plane", sensor.PLANE),
+    **{
+        name: tuple(replace(metric, format=replace(metric.format, family=name)) for metric in metrics)
+        for name, metrics in _FAMILIES.items()
+    },
 }
 KNOWN_FORMATS = {metric.name: metric.format for metric in METRICS}
 

@@ -11,7 +11,7 @@ Pixels without a truth are left out. Holes of a prediction count as errors, exce
 """
 
 import math
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from torch import Tensor
 from dsr.geometry.surface import length
 from dsr.metrics.boundaries import depth_pro_scores
 from dsr.metrics.depth import covered
-from dsr.metrics.formats import Metric, column, target_mask
+from dsr.metrics.formats import Metric, column, of_parts, target_mask
 from dsr.metrics.functional import SurfacePair, once_per_pair
 from dsr.utils.compute_device import in_own_precision
 
@@ -114,15 +114,27 @@ def wkdr(pair: SurfacePair) -> Tensor:
 
 
 @once_per_pair
-def beyond_disparity(pair: SurfacePair) -> Tensor:
-    """Return the fraction of pixels with a ratio to the true depth of 1.25^.125 or more, (B,), disparity fitted."""
-    return _beyond(pair, inverse=True)
+def beyond(pair: SurfacePair) -> dict[str, Tensor]:
+    """Return the fractions of pixels with a ratio to the true depth of :data:`RATIO` or more, (B,) each.
 
-
-@once_per_pair
-def beyond_depth(pair: SurfacePair) -> Tensor:
-    """Return the same as :func:`beyond_disparity`, (B,), with depth fitted."""
-    return _beyond(pair, inverse=False)
+    They are named by what is fitted to the truth by least squares, ``disparity`` or ``depth``.
+    """
+    weights, found = pair.depth_mask.double(), {}
+    count = weights.sum(dim=(2, 3), keepdim=True)
+    for fitted in ("disparity", "depth"):
+        inverse = fitted == "disparity"
+        given = (1 / pair.prediction, 1 / pair.target) if inverse else (pair.prediction, pair.target)
+        values, target = (each.double() for each in given)
+        means = [(each * weights).sum(dim=(2, 3), keepdim=True) / count for each in (values, target)]
+        centred = (values - means[0]) * weights
+        square = (centred * centred).sum(dim=(2, 3), keepdim=True)
+        factor = (centred * (target - means[1])).sum(dim=(2, 3), keepdim=True) / square.clamp(min=1e-300)
+        aligned = ((values - means[0]) * factor + means[1]).clamp(min=NEAREST)
+        aligned = 1 / aligned if inverse else aligned
+        ratio = torch.maximum(aligned / pair.target, pair.target / aligned)
+        within = ((ratio < RATIO) & pair.depth_mask).sum(dim=(1, 2, 3))
+        found[fitted] = 1 - within.double() / pair.target_mask.sum(dim=(1, 2, 3))
+    return found
 
 
 def boundary_error(pair: SurfacePair) -> Tensor:
@@ -130,12 +142,11 @@ def boundary_error(pair: SurfacePair) -> Tensor:
     return 1 - depth_pro_scores(pair)["F1"]
 
 
-WEIGHTS = {wkdr: 3.65, beyond_disparity: 0.18, beyond_depth: 0.01, boundary_error: 0.20, rel_normal: 1.94}
-
-
 def sawa_h(pair: SurfacePair) -> Tensor:
-    """Return SAWA-H, (B,), the sum of its parts by :data:`WEIGHTS`; lower is better."""
-    return torch.stack([weight * part(pair).double() for part, weight in WEIGHTS.items()]).sum(dim=0)
+    """Return SAWA-H, (B,), see the module; lower is better."""
+    fitted, weights = beyond(pair), (3.65, 0.18, 0.01, 0.20, 1.94)
+    parts = (wkdr(pair), fitted["disparity"], fitted["depth"], boundary_error(pair), rel_normal(pair))
+    return torch.stack([weight * part.double() for weight, part in zip(weights, parts, strict=True)]).sum(dim=0)
 
 
 def _taken(values: Tensor, source: Tensor) -> Tensor:
@@ -171,32 +182,13 @@ def _pair_error(rows: Tensor, first: Tensor, second: Tensor) -> Tensor:
     return total / count
 
 
-def _beyond(pair: SurfacePair, *, inverse: bool) -> Tensor:
-    """Return the fraction beyond :data:`RATIO`, with depth or its inverse fitted to the truth by least squares."""
-    given = (1 / pair.prediction, 1 / pair.target) if inverse else (pair.prediction, pair.target)
-    values, target = (each.double() for each in given)
-    weights = pair.depth_mask.double()
-    count = weights.sum(dim=(2, 3), keepdim=True)
-    means = [(each * weights).sum(dim=(2, 3), keepdim=True) / count for each in (values, target)]
-    centred = (values - means[0]) * weights
-    square = (centred * centred).sum(dim=(2, 3), keepdim=True)
-    factor = (centred * (target - means[1])).sum(dim=(2, 3), keepdim=True) / square.clamp(min=1e-300)
-    aligned = ((values - means[0]) * factor + means[1]).clamp(min=NEAREST)
-    aligned = 1 / aligned if inverse else aligned
-    ratio = torch.maximum(aligned / pair.target, pair.target / aligned)
-    within = ((ratio < RATIO) & pair.depth_mask).sum(dim=(1, 2, 3))
-    return 1 - within.double() / pair.target_mask.sum(dim=(1, 2, 3))
-
-
-METRICS: tuple[Metric, ...] = tuple(
-    Metric(f"EvalMDE_{name}", function, target_mask, shown, min_size=MIN_SIZE, whole=True)
-    for name, function, shown in (
-        ("SAWA_H", sawa_h, column("SAWA-H", "", digits=3)),
-        ("RelNormal", rel_normal, column("RelNormal", "rad", digits=3)),
-        ("WKDR", wkdr, column("WKDR", "%", 1e2, 2)),
-        ("beyond_disparity", beyond_disparity, column("Beyond", "1.028 x, disparity fitted, %", 1e2)),
-        ("beyond_depth", beyond_depth, column("Beyond", "1.028 x, depth fitted, %", 1e2)),
-        ("boundary", boundary_error, column("1 - F1", "Depth Pro, %", 1e2)),
-        ("covered", covered, column("Covered", "%", 1e2, higher_is_better=True)),
-    )
+_alone = partial(Metric, mask=target_mask, min_size=MIN_SIZE, whole=True)
+_fitted = {name: column("Beyond", f"1.028 x, {name} fitted, %", 1e2) for name in ("disparity", "depth")}
+METRICS: tuple[Metric, ...] = (
+    _alone("EvalMDE_SAWA_H", sawa_h, format=column("SAWA-H", "", digits=3)),
+    _alone("EvalMDE_RelNormal", rel_normal, format=column("RelNormal", "rad", digits=3)),
+    _alone("EvalMDE_WKDR", wkdr, format=column("WKDR", "%", 1e2, 2)),
+    *of_parts("EvalMDE_beyond_", beyond, target_mask, _fitted, min_size=MIN_SIZE, whole=True),
+    _alone("EvalMDE_boundary", boundary_error, format=column("1 - F1", "Depth Pro, %", 1e2)),
+    _alone("EvalMDE_covered", covered, format=column("Covered", "%", 1e2, higher_is_better=True)),
 )

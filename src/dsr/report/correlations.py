@@ -29,11 +29,9 @@ from dsr.utils.files import replacing, write_text
 Kind = Literal["pearson", "spearman"]
 KINDS: tuple[Kind, ...] = ("pearson", "spearman")
 REFERENCE = "LPIPS_v"
-DEPTH_LIMIT = 0.5
-"""Limit at which RMSE_d is clipped as in the paper, metres, because of a few outliers."""
+DEPTH_LIMIT = 0.5  # limit at which RMSE_d is clipped as in the paper, metres, because of a few outliers
 _ABOUT = ["dataset", "scene", "scale", "downsampling", "label", "seed"]
-_LEAST = 3
-"""Minimum number of points of a correlation."""
+_LEAST = 3  # minimum number of points of a correlation
 _STYLE: dict[Any, Any] = {
     "pdf.fonttype": 42,
     "ps.fonttype": 42,
@@ -42,18 +40,15 @@ _STYLE: dict[Any, Any] = {
     "axes.unicode_minus": False,
 }
 _DPI = 200
-_PANEL = 1.35
-_ABOVE = 0.95
-"""Size of a panel, and height of the title and legend, inches."""
+_PANEL, _ABOVE = 1.35, 0.95  # size of a panel, and height of the title and legend, inches
 _HIGHLIGHT, _FRAME = "#fff4d6", "#c98a00"
 _STRENGTH = "RdBu_r"
-_MANY = 3000
-"""Number of points above which the PDF has them as an image, since it would take minutes to open otherwise."""
+_MANY = 3000  # number of points above which the PDF has them as an image, since it would take minutes to open otherwise
+# Colours of the paper's methods and Facets. Any two differ by 16 in CIEDE2000, also to protanopes and deuteranopes.
 FIXED = {
     "Bicubic": "#8b8f8f", "SRfS": "#efe845", "EG": "#1b570d", "PDN": "#50ddae", "DG": "#9d54a6", "DIP": "#de9257",
     "DIP-V": "#521b2e", "MSG": "#65b3e6", "MSG-V": "#0f165b", "Facets": "#d52554",
 }  # fmt: skip
-"""Colours of the paper's methods and Facets. Any two differ by 16 in CIEDE2000, also to protanopes and deuteranopes."""
 _FREE = ("#999933", "#c9a0dc", "#004d40", "#f5a3b5", "#7fb800", "#0072b2", "#5c4033", "#000000")
 _GOLDEN = 0.618033988749895
 

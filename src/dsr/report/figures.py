@@ -29,25 +29,19 @@ from dsr.report.tables import unique_name
 from dsr.report.worker_pool import WorkerPool
 from dsr.sample import DepthSample
 
-ROWS = 5
-"""Maximum number of scenes on a page."""
-_DETAIL = 5
-"""The side of a detail is 1/5 of the shorter side of the picture."""
-_CENTIMETRE_LIMIT = 0.02
-"""Limit of a row, metres, from which errors are shown in centimetres."""
+ROWS = 5  # maximum number of scenes on a page
+_DETAIL = 5  # the side of a detail is 1/5 of the shorter side of the picture
+_CENTIMETRE_LIMIT = 0.02  # limit of a row, metres, from which errors are shown in centimetres
 _LEAST_ERROR = 1e-5
-_PREFERRED = ("statue", "lucy")
-"""Scenes to show under the lights."""
-_CANDIDATES = 8
-"""Maximum number of scenes to choose that one from."""
+_PREFERRED = ("statue", "lucy")  # scenes to show under the lights
+_CANDIDATES = 8  # maximum number of scenes to choose that one from
 
 
 class Figures:
     """All figures of the runs of ``workers``, which begin to draw them at once; existing files are replaced."""
 
     def __init__(self, folder: Path, workers: WorkerPool, light: str = FIGURE_LIGHT) -> None:
-        self.notes: list[str] = []
-        """One line per scene or result that could not be drawn."""
+        self.notes: list[str] = []  # one line per scene or result that could not be drawn
         self._pages = [*pages_of(workers.results, KINDS, light), None]
         self._drawn = workers.map(functools.partial(draw_page, folder), self._pages)
 
@@ -148,12 +142,12 @@ def error_row(shown: Shown, _: str) -> Row | None:
     return _row(shown, scaled, ("RMSE_d",), None, style, bar=f"result - truth, {unit}", extend="both")
 
 
+# What makes a row, and the text below, of each kind of grid
 _GRIDS: dict[str, tuple[Callable[[Shown, str], Row | None], str]] = {
     "renderings": (rendering_row, "surfaces lit by {}; below: DSSIM_v / RMSE_v, 1/1000, lower is better"),
     "depth": (depth_row, "distance to the image plane; below: RMSE_d, mm, lower is better"),
     "errors": (error_row, "result - truth: red is too far, blue too near; below: RMSE_d, mm, lower is better"),
 }
-"""What makes a row, and the text below, of each kind of grid."""
 KINDS = tuple(_GRIDS)
 
 

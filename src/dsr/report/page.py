@@ -26,14 +26,12 @@ from dsr.utils.files import write_text
 from dsr.utils.guards import natural_key
 from dsr.utils.progress import Steps, megabytes
 
-_LONGEST = 1024
-"""Longer side of a picture, pixels, if none is given and the page has few surfaces."""
-_MOST_PIXELS = 48 * _LONGEST**2
-"""Of all surfaces of a page together, if no size is given; they take 1 to 4 bytes each."""
+_LONGEST = 1024  # longer side of a picture, pixels, if none is given and the page has few surfaces
+_MOST_PIXELS = 48 * _LONGEST**2  # of all surfaces of a page together, if no size is given; they take 1 to 4 bytes each
 _COLOUR_MAPS = {"depth": "viridis", "error": "RdBu_r", "angle": "magma"}
 _SCRIPTS = ("core.js", "values.js", "tables.js", "scenes.js", "report.js")
+# Folders beside the page with files to link to, and their suffixes
 _FOLDERS = {"tables": (".csv", ".md", ".tex"), "metrics": (".csv",), "figures": (".pdf",)}
-"""Folders beside the page with files to link to, and their suffixes."""
 
 
 class Pictures:

@@ -34,16 +34,14 @@ from dsr.pictures.depth_views import limits_of, normals_seen_by, reduced
 from dsr.report.shown_scenes import View, results_of, stored_sample, views_of
 from dsr.sample import DepthSample
 
-_LEAST_ERROR = 1e-4
-"""Minimum limit of the error colours, metres."""
-_LEAST_ANGLE = 0.1
-"""Minimum of the largest stored angle, degrees."""
+_LEAST_ERROR = 1e-4  # minimum limit of the error colours, metres
+_LEAST_ANGLE = 0.1  # minimum of the largest stored angle, degrees
+# About how many pixels of a setting are compared with what was expected; of more, every second, third, and so on
 _MOST_PIXELS = 4_000_000
-"""About how many pixels of a setting are compared with what was expected; of more, every second, third, and so on."""
+# Values of a mask: missing; valid depth without a normal; valid depth and normal
 NOTHING_VALID, DEPTH_VALID, ALL_VALID = 0, 128, 255
-"""Values of a mask: missing; valid depth without a normal; valid depth and normal."""
+# A third of the time of zlib's level 6 for 8 % more bytes, a fifteenth of that of lossless WebP
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
-"""A third of the time of zlib's level 6 for 8 % more bytes, a fifteenth of that of lossless WebP."""
 
 
 @dataclass
@@ -69,8 +67,8 @@ class PictureStore:
         return torch.where(valid, fitted, 0).permute(1, 2, 0).numpy(), valid.numpy()
 
 
+# Data of a scene (None for a scene without pictures), its pictures, and notes
 Encoded = tuple[dict[str, Any] | None, PictureStore, list[str]]
-"""Data of a scene (None for a scene without pictures), its pictures, and notes."""
 
 
 def encode_scene(longest: int, results: Results, place: tuple[BenchmarkSetting, str]) -> Encoded:

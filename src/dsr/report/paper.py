@@ -14,30 +14,26 @@ import pandas as pd
 
 from dsr.evaluation.results import Run
 
+# Method names of the paper by name in ``scores.csv``, where the label may differ from them
 PAPER_METHODS = {"bicubic": "Bicubic", "dip": "DIP", "dip_v": "DIP-V", "msg": "MSG", "msg_v": "MSG-V"}
-"""Method names of the paper by name in ``scores.csv``, where the label may differ from them."""
-OF_FILES = ("external", "monocular", "onnx")
-"""Methods whose maps or networks are files of a user's."""
-REIMPLEMENTED = ("SRfS", "EG", "PDN", "DG")
-"""Methods that the paper ran with other programs or weights than dsr's."""
+OF_FILES = ("external", "monocular", "onnx")  # methods whose maps or networks are files of a user's
+REIMPLEMENTED = ("SRfS", "EG", "PDN", "DG")  # methods that the paper ran with other programs or weights than dsr's
+# By data set, the scenes that the paper evaluated on: neither re-created nor other frames of the same place
 PAPER_FILES = {
     "simgeo": ("lucy",),
     "middlebury": ("vintage", "recycle", "umbrella", "classroom1", "playroom", "backpack", "jadeplant"),
 }
-"""By data set, the scenes that the paper evaluated on: neither re-created nor other frames of the same place."""
+# The paper's averages over those scenes of a data set
 AVERAGES = {"middlebury": "Average performance on Middlebury dataset"}
-"""The paper's averages over those scenes of a data set."""
-_RELEASED = ("lucy", "plant", "vintage")
-"""Scenes that the paper's authors released as files, for a user's own folder."""
-_FOLDER = "dsr.data.folder.Folder"
-"""Reader of users' own folders."""
-_PAPER_SIZE = 512
-"""Height and width of the paper's pictures, pixels."""
+_RELEASED = ("lucy", "plant", "vintage")  # scenes that the paper's authors released as files, for a user's own folder
+_FOLDER = "dsr.data.folder.Folder"  # reader of users' own folders
+_PAPER_SIZE = 512  # height and width of the paper's pictures, pixels
+# Settings of data sets with which their scenes are the paper's; a data set lacks some
 _PAPER_SETTINGS = {"size": _PAPER_SIZE, "crop": 0.5}
-"""Settings of data sets with which their scenes are the paper's; a data set lacks some."""
+# Settings of data sets that name scenes: those of the paper; a data set lacks some
 _PAPER_SCENES = {"fill": ["vintage"], "without_offset": ["vintage"]}
-"""Settings of data sets that name scenes: those of the paper; a data set lacks some."""
 TITLES = {"simgeo": "SimGeo", "icl": "ICL-NUIM", "middlebury": "Middlebury"}
+# The scenes that the paper averages over, by data set; those not in PAPER_FILES are others of the same description
 PAPER_SCENES = {
     "simgeo": (
         "cube_high_freq",
@@ -50,9 +46,7 @@ PAPER_SCENES = {
     "icl": ("painting", "sofa", "plant", "office", "coat_rack", "displays"),
     "middlebury": PAPER_FILES["middlebury"],
 }
-"""The scenes that the paper averages over, by data set; those not in PAPER_FILES are others of the same description."""
-STAND_IN = "statue"
-"""SimGeo scene used if Lucy is not available."""
+STAND_IN = "statue"  # SimGeo scene used if Lucy is not available
 _WITH = "Average performance on the scenes with missing measurements (Middlebury excluding Vintage)"
 
 

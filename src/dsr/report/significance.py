@@ -14,8 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import norm, t
 
-LEAST = 5
-"""Smallest number of scenes of an interval."""
+LEAST = 5  # smallest number of scenes of an interval
 LEVEL = 0.05
 CONFIDENCE = 0.95
 _DRAWS = 10_000

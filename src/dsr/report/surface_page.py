@@ -29,30 +29,26 @@ from dsr.pictures.depth_views import reduced
 from dsr.report.html_page import asset, fill, json_text, palette, policy
 from dsr.utils.files import write_text
 from dsr.utils.guards import opened
+from dsr.utils.progress import show_length
 
-MARK = '<meta name="generator" content="dsr view">'
-"""What a page begins with that a new one may replace."""
+MARK = '<meta name="generator" content="dsr view">'  # what a page begins with that a new one may replace
 _SCRIPTS = ("core.js", "decode.js", "mesh.js", "webgl.js", "pose.js", "view.js")
 _COLOURS = "magma"
-ANGLES = (1.0, 60.0)
-"""Ends of the colours of the normals' expected errors in degrees, those of ``confidence.png``."""
+ANGLES = (1.0, 60.0)  # ends of the colours of the normals' expected errors in degrees, those of ``confidence.png``
+# Ends of the colours of the depths' expected errors as fractions of the median depth, those of ``confidence.png``
 DEPTHS = (1e-3, 1e-1)
-"""Ends of the colours of the depths' expected errors as fractions of the median depth, those of ``confidence.png``."""
+# Longer sides of the pictures for browsers without WebGL and of those to choose from, pixels
 _STATIC, _THUMB = 640, 160
-"""Longer sides of the pictures for browsers without WebGL and of those to choose from, pixels."""
 _QUALITY = 85
+# Which pixels of an (h, w) map are joined: with their right neighbours, (h, w - 1), and those below, (h - 1, w)
 Joints = tuple[np.ndarray, np.ndarray]
-"""Which pixels of an (h, w) map are joined: with their right neighbours, (h, w - 1), and those below, (h - 1, w)."""
 
-LEVELS = 2**24 - 1
-"""Highest level of inverse depth; 1 is the lowest, 0 is a hole."""
-ERROR_LEVELS = 255
-"""Highest level of an error; 1 is the lowest, 0 is unknown."""
+LEVELS = 2**24 - 1  # highest level of inverse depth; 1 is the lowest, 0 is a hole
+ERROR_LEVELS = 255  # highest level of an error; 1 is the lowest, 0 is unknown
+# Flags of a pixel: joined to its right neighbour and to the one below, without and with doubtful pixels; doubtful; not
+# measured
 RIGHT, BELOW, RIGHT_WITH_DOUBTFUL, BELOW_WITH_DOUBTFUL, DOUBTFUL, FILLED = 1, 2, 4, 8, 16, 32
-"""Flags of a pixel: joined to its right neighbour and to the one below, without and with doubtful pixels; doubtful;
-not measured."""
-_STRIP = 1 << 20
-"""Pixels whose joints are looked for at a time."""
+_STRIP = 1 << 20  # pixels whose joints are looked for at a time
 
 
 @dataclass(frozen=True)
@@ -105,7 +101,12 @@ def pack_result(result: ViewedResult, vertices: int, photo_side: int) -> Packed:
     if result.depth_lr is not None:
         maps["before"] = result.depth_lr
         grids["before"] = _reduce(result.depth_lr, result.camera, vertices)
-    about: dict[str, Any] = {"name": result.name, "facts": result.facts or {}, "notes": list(result.notes)}
+    facts = dict(result.facts or {})
+    if result.depth_error is not None and result.angle_error is not None:
+        depth, angle = (np.nanpercentile(each, (50, 90)) for each in (result.depth_error, result.angle_error))
+        facts["expected error of the depth"] = f"{show_length(depth[0], 2)}, 90 % below {show_length(depth[1], 2)}"
+        facts["expected error of the normals"] = f"{angle[0]:.1f} degrees, 90 % below {angle[1]:.1f}"
+    about: dict[str, Any] = {"name": result.name, "facts": facts, "notes": list(result.notes)}
     data = {}
     for name, grid in grids.items():
         about[name], data[name] = pack_grid(grid)
@@ -257,7 +258,20 @@ def find_joints(depth: np.ndarray, factor: int) -> Joints:
     Two neighbouring blocks are joined if at least half of the rows (or columns) have no cut between the middles of the
     two. Cuts found in the reduced map would be too many: the larger the pixels, the more a surface bends between them.
     """
-    return _joined_along(depth, factor), _joined_along(depth.T, factor).T
+    joints = []
+    for lines in (depth, depth.T):
+        height, width = lines.shape[0] // factor, lines.shape[1] // factor
+        joined = np.empty((height, width - 1), bool)
+        rows = max(1, _STRIP // (lines.shape[1] * factor))
+        for start in range(0, height, rows):
+            stop = min(start + rows, height)
+            across, _ = find_connections(1 / lines[start * factor : stop * factor].astype(np.float64))
+            broken = np.pad(np.cumsum(~across, axis=1), ((0, 0), (1, 0)))  # number of cuts left of each pixel
+            middles = factor // 2 + factor * np.arange(width)
+            whole = broken[:, middles[1:]] == broken[:, middles[:-1]]
+            joined[start:stop] = 2 * whole.reshape(stop - start, factor, width - 1).sum(axis=1) >= factor
+        joints.append(joined)
+    return joints[0], joints[1].T
 
 
 def pack_grid(grid: Grid) -> tuple[dict[str, Any], str]:
@@ -309,18 +323,3 @@ def _flags(grid: Grid) -> np.ndarray:
         flags[:, :-1] |= np.where(across & there[:, 1:] & there[:, :-1], right, 0).astype(np.uint8)
         flags[:-1] |= np.where(down & there[1:] & there[:-1], below, 0).astype(np.uint8)
     return flags
-
-
-def _joined_along(depth: np.ndarray, factor: int) -> np.ndarray:
-    """Return which blocks of a map, (H, W), are joined with their right neighbours."""
-    height, width = depth.shape[0] // factor, depth.shape[1] // factor
-    joined = np.empty((height, width - 1), bool)
-    rows = max(1, _STRIP // (depth.shape[1] * factor))
-    for start in range(0, height, rows):
-        stop = min(start + rows, height)
-        across, _ = find_connections(1 / depth[start * factor : stop * factor].astype(np.float64))
-        broken = np.pad(np.cumsum(~across, axis=1), ((0, 0), (1, 0)))  # number of cuts left of each pixel
-        middles = factor // 2 + factor * np.arange(width)
-        whole = broken[:, middles[1:]] == broken[:, middles[:-1]]
-        joined[start:stop] = 2 * whole.reshape(stop - start, factor, width - 1).sum(axis=1) >= factor
-    return joined

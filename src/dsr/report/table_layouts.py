@@ -19,16 +19,14 @@ from dsr.utils.files import write_text
 
 MISSING = "\N{EN DASH}"
 _SPECIAL = re.compile(r"[\\`*\[\]<>|~&#]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])")
-_ROWS = 26
-"""Maximum rows of a table in LaTeX: those of a page in landscape format."""
+_ROWS = 26  # maximum rows of a table in LaTeX: those of a page in landscape format
 _LATEX_SPECIAL = {
     "\\": "\\textbackslash{}", "{": "\\{", "}": "\\}", "$": "\\$", "&": "\\&", "#": "\\#", "%": "\\%", "_": "\\_",
     "~": "\\textasciitilde{}", "^": "\\textasciicircum{}", "<": "\\textless{}", ">": "\\textgreater{}",
     "|": "\\textbar{}", '"': "\\textquotedbl{}", "`": "\\textasciigrave{}",
     "\N{PLUS-MINUS SIGN}": "$\\pm$", "\N{EN DASH}": "--", "\N{MULTIPLICATION SIGN}": "$\\times$",
 }  # fmt: skip
-_LAST_LETTER = 0x17F
-"""Last code point of Latin Extended-A; the font encoding T1 has no letters after it."""
+_LAST_LETTER = 0x17F  # last code point of Latin Extended-A; the font encoding T1 has no letters after it
 _HEAD = r"""\documentclass{article}
 \usepackage[T1]{fontenc}
 \usepackage[utf8]{inputenc}

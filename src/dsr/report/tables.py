@@ -137,6 +137,7 @@ class Fact(NamedTuple):
     number: bool = False  # aligned like numbers, and left out beside the paper's values
 
 
+# All such columns, from the left. Another one here is in every table.
 FACTS = (
     Fact("kind", lambda row: "average" if row.about.average else "scene"),
     Fact("scene", lambda row: row.about.title, lambda _: True),
@@ -146,13 +147,12 @@ FACTS = (
     Fact("method", lambda row: row.label, lambda _: True),
     Fact("seeds", lambda row: row.seeds or None, lambda rows: any(row.seeds > 1 for row in rows), number=True),
 )
-"""All such columns, from the left. Another one here is in every table."""
+# The columns of the user study
 _SHARES = {key: MetricFormat(heading, "%", digits=1, higher_is_better=True) for key, heading in PERCENTAGES.items()}
-"""The columns of the user study."""
 
 
+# Scores by label, scene, metric and seed: worst of four lights, in the units of tables; only finite values
 Values = Mapping[str, Mapping[Place, Mapping[str, Mapping[int, float]]]]
-"""Scores by label, scene, metric and seed: worst of four lights, in the units of tables; only finite values."""
 
 
 def shown(column: MetricFormat, value: float) -> str:

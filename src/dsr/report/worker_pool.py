@@ -3,13 +3,13 @@
 import contextlib
 import os
 from collections.abc import Callable, Generator, Sequence
-from typing import Any, TypeVar
+from copy import copy
+from typing import TypeVar
 
 from dsr.evaluation.results import Results
 from dsr.utils.processes import Pool
 from dsr.utils.progress import SILENT
 
-_results: Results | None = None  # that this process works on, if it is a worker
 _Item = TypeVar("_Item")
 _Value = TypeVar("_Value")
 
@@ -23,7 +23,7 @@ class WorkerPool(contextlib.ExitStack):
         self._pool: Pool | None = None
         if workers > 1:
             threads = max(1, (os.cpu_count() or 1) // workers)
-            self._pool = self.enter_context(Pool(workers, _begin, (results,), threads, say))
+            self._pool = self.enter_context(Pool(workers, copy, (results,), threads, say))
 
     def map(self, function: Callable[[Results, _Item], _Value], items: Sequence[_Item]) -> Generator[_Value]:
         """Return the values of ``function(results, item)``, of a module's function, in the order of the items.
@@ -32,18 +32,4 @@ class WorkerPool(contextlib.ExitStack):
         """
         if self._pool is None:
             return (function(self.results, item) for item in items)
-        calls = [(function, item) for item in items]
-        return (value for _, value in self._pool.results(_call, calls, ordered=True))
-
-
-def _begin(results: Results) -> None:
-    """Prepare a worker."""
-    global _results  # noqa: PLW0603 - the worker's own
-    _results = results
-
-
-def _call(call: tuple[Callable[[Results, Any], Any], Any]) -> Any:
-    """Call a function in a worker."""
-    assert _results is not None  # noqa: S101 - workers begin with _begin
-    function, item = call
-    return function(_results, item)
+        return (value for _, value in self._pool.results(function, items, ordered=True))

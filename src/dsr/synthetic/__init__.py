@@ -31,7 +31,6 @@ class Rendering:
     camera: Camera
 
     def __post_init__(self) -> None:
-        """Check the arrays."""
         size = (self.camera.height, self.camera.width)
         came = (self.rgb.dtype, self.rgb.shape, self.depth.dtype, self.depth.shape)
         if came != (np.uint8, (*size, 3), np.float64, size):

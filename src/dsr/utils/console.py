@@ -4,7 +4,6 @@ import contextlib
 import errno
 import functools
 import io
-import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -25,8 +24,6 @@ _TURNING = "\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"  # character
 _LOG_WIDTH = 110  # columns where the output is not a terminal
 _FIRST_LINE, _NEXT_LINE = 3.0, 10.0  # seconds until the first line about running work, and between two of them
 _MANY, _LONG = 50, 2.0  # of more items only those get a line that take so many seconds
-# An address up to its host; a password may have a slash or an @ that should be written %2F and %40.
-_CREDENTIALS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*://)(?:[^\s/]*|\S*:\S*)@")
 
 
 def open_console() -> Console:
@@ -65,20 +62,11 @@ def shorten(text: str, most: int = _LONGEST) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a text in the form in which commands print texts.
-
-    It is without the characters that control a terminal or turn text, which names of files may have, and without the
-    names and passwords of addresses, see :func:`without_credentials`.
-    """
+    """Return a text without the characters that control a terminal or turn text, which names of files may have."""
     return "".join(
         "\N{REPLACEMENT CHARACTER}" if (category(each) == "Cc" and each != "\n") or each in _TURNING else each
-        for each in without_credentials(text)
+        for each in text
     )
-
-
-def without_credentials(text: str) -> str:
-    """Return a text with its addresses as ``https://host/path`` instead of ``https://name:password@host/path``."""
-    return _CREDENTIALS.sub(r"\1", text)
 
 
 def one_line(error: BaseException) -> str:

@@ -225,11 +225,11 @@ def naming(place: object) -> Iterator[None]:
         raise ValueError(f"{place}: {error}") from error
 
 
-def expect_one_of(key: str, value: object, known: Collection[object]) -> None:
-    """Raise a ValueError if a key's value is not one of those that are known."""
+def expect_one_of(key: str, value: object, known: Collection[object], hint: str = "") -> None:
+    """Raise a ValueError, which ends with a hint, if a key's value is not one of those that are known."""
     if value not in known:
         names = ", ".join("null" if each is None else str(each) for each in known)
-        raise ValueError(f"{key}: expected one of {names}, got {value!r}")
+        raise ValueError(f"{key}: expected one of {names}, got {value!r:.60}{hint}")
 
 
 def expect_positive(*, or_zero: bool = False, **options: float) -> None:

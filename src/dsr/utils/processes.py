@@ -30,6 +30,7 @@ _Value = TypeVar("_Value")
 LOCKS = ".locks"
 _BETWEEN_LOOKS = 0.3
 _SECONDS_TO_END = 2.0  # in which a worker may remove its temporary files
+_own: Any = None  # what this process, if it is a worker, has prepared
 _LOST = "worker processes were killed twice, perhaps for want of memory; fewer workers need less"
 
 
@@ -110,7 +111,8 @@ def _digest(name: str) -> str:
 class Pool:
     """Worker processes, to use in a ``with`` statement; the end of an interrupted one terminates them.
 
-    Each worker first calls ``prepare(*arguments)``, and computes with a number of threads, or with those of torch.
+    Each worker first calls ``prepare(*arguments)``, and computes with a number of threads, or with those of torch. What
+    that returns, if anything, is the first argument of the functions that it calls afterwards.
     """
 
     def __init__(
@@ -147,7 +149,7 @@ class Pool:
             executor.shutdown(cancel_futures=True)
 
     def results(
-        self, function: Callable[[_Item], _Value], items: Sequence[_Item], *, ordered: bool = False
+        self, function: Callable[..., _Value], items: Sequence[_Item], *, ordered: bool = False
     ) -> Generator[tuple[_Item, _Value]]:
         """Begin to work on items, and return each with its value, as they come or in their order.
 
@@ -169,7 +171,7 @@ class Pool:
         return values()
 
     def _submit(
-        self, function: Callable[[_Item], _Value], items: Sequence[_Item]
+        self, function: Callable[..., _Value], items: Sequence[_Item]
     ) -> tuple[dict[Future[_Value], _Item], ProcessPoolExecutor]:
         while True:
             executor = self._executors[-1]
@@ -189,20 +191,21 @@ class Pool:
 
 
 def _begin(plan: bytes, threads: int | None) -> None:
+    global _own  # noqa: PLW0603 - the worker's
     interruption.end_with(os.getppid())
     if threads is not None:
         _set_threads(threads, threads)
     prepare, arguments = pickle.loads(plan)  # noqa: S301 - of the parent
     if prepare is not None:
-        prepare(*arguments)
+        _own = prepare(*arguments)
     gc.freeze()  # imported modules are not gone through again
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # until here it just ends this process
 
 
-def _call(function: Callable[[_Item], _Value], item: _Item) -> _Value:
+def _call(function: Callable[..., _Value], item: Any) -> _Value:
     """Call a function in a worker; when it is terminated, temporary files are removed first."""
     try:
-        return function(item)
+        return function(item) if _own is None else function(_own, item)
     except (SystemExit, KeyboardInterrupt):
         os._exit(143)
 

@@ -166,7 +166,7 @@ def get(
     root.mkdir(parents=True, exist_ok=True)
     with lock_directory(root):
         checksums = Checksums(root)
-        for item in {item.path: item for item in items}.values():
+        for item in items:
             try:
                 if item.unpack_to is None:
                     _get_file(item, checksums, progress, mirror)
@@ -396,16 +396,15 @@ def checksums_of(collection: Collection, root: Path) -> str:
         return "noted" if any(name.startswith(f"{collection.folders[0]}/") for name in recorded) else "unknown"
     kinds = Counter(
         "pinned" if item.sha256 is not None else "noted" if item.path in recorded else "unknown"
-        for item in {item.path: item for item in collection.items}.values()
+        for item in collection.items
     )
     return next(iter(kinds)) if len(kinds) == 1 else ", ".join(f"{count} {kind}" for kind, count in kinds.items())
 
 
 def absent(items: Iterable[Item], root: Path) -> list[Item]:
-    """Return the items that are not there, or not in their recorded sizes; each path once."""
+    """Return the items that are not there, or not in their recorded sizes."""
     checksums = Checksums(root)
-    by_path = {item.path: item for item in items}
-    return [item for item in by_path.values() if _lack(item, checksums) is not None]
+    return [item for item in items if _lack(item, checksums) is not None]
 
 
 def verify(collection: Collection, root: Path, progress: Progress) -> list[str]:

@@ -169,8 +169,8 @@ class ShadingSolver:
             self.theta, energy = torch.where(better, near, self.theta), torch.where(better, lower, energy)
             self._damping = (self._damping * torch.where(better, _LESS, _MORE)).clamp(1e-6, 1e6)
 
-    def update_depth(self) -> None:
-        """Lower the Lagrangian, which is quadratic in z, by conjugate gradients from the current z."""
+    def update_depth(self, growth: float) -> None:
+        """Lower the Lagrangian in z by conjugate gradients; then update the multiplier, and multiply the penalty."""
 
         def curvature(z: Tensor) -> Tensor:  # the second derivative in z, times z; 0 outside the mask
             inside = self._weight * z
@@ -184,9 +184,6 @@ class ShadingSolver:
             + self.penalty * self.slopes.adjoint(self.coupling * wanted)
         )
         self.z = self.z + conjugate_gradients(curvature, right, _CG_ITERATIONS, _CG_TOLERANCE)
-
-    def update_missed(self, growth: float) -> None:
-        """Add (p, q, z) - theta to the multiplier, and multiply the penalty."""
         self.missed = (self.missed + self.slopes(self.z) - self.theta) / growth
         self.penalty *= growth
 
@@ -247,8 +244,10 @@ class ShadingSolver:
     def _energies(self, albedo: Tensor, shading: Tensor, regions: Regions | None) -> tuple[float, float]:
         """Return the terms of E for the shading and for the albedo's boundaries, 0 without regions."""
         shaded = 0.5 * float((self._weight * (albedo * shading - self.problem.rgb).square()).sum())
-        length = 0 if regions is None else boundary_length(regions, self.problem.inside)
-        return shaded, self.problem.boundary_weight * length
+        if regions is None:
+            return shaded, 0.0
+        borders = _find_borders(regions.labels, self.problem.inside)
+        return shaded, self.problem.boundary_weight * int((borders.one != borders.other).sum())
 
 
 def _chain_to_theta(by_m: Tensor, rays: Tensor) -> Tensor:
@@ -357,8 +356,7 @@ class ShapeFromShading(Method):
             solver.update_albedo(anew=done % _RENEW == 1)
             solver.update_lighting()
             solver.update_theta()
-            solver.update_depth()
-            solver.update_missed(self.growth)
+            solver.update_depth(self.growth)
             theta = solver.slopes(solver.z)
             terms = solver.terms(theta)
             objective = sum(terms.values())
@@ -475,12 +473,6 @@ def fit_albedo(rgb: Tensor, shading: Tensor, regions: Regions) -> Tensor:
         for each in (shading.square(), shading * rgb)
     )
     return _best_albedo(squares, products)[regions.labels].movedim(-1, 1)
-
-
-def boundary_length(regions: Regions, inside: Tensor) -> int:
-    """Return the number of pairs of neighbours in different regions, both inside the mask (B, 1, H, W)."""
-    borders = _find_borders(regions.labels, inside)
-    return int((borders.one != borders.other).sum())
 
 
 def _best_albedo(squares: Tensor, products: Tensor) -> Tensor:

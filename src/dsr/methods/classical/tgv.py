@@ -192,7 +192,7 @@ class TotalGeneralisedVariation(Method):
         root = self.step_ratio**0.5
         along_u, along_v = g.uu + g.uv.abs(), g.vv + g.uv.abs()
         inside = _zero_border(torch.stack((along_u, along_v), dim=1))
-        step_u = 1 / (root * sum_adjacent(inside).clamp(min=1e-6))
+        step_u = 1 / (root * divergence(inside, sign=1).clamp(min=1e-6))
         step_v = _SLOPE / (inside[:, :, 0] + 4) / root
         step_p = 1 / ((2 + _SLOPE) * torch.maximum(along_u, along_v))[:, None] * root
         return step_u, step_v, step_p, root / (2 * _SLOPE)
@@ -204,13 +204,8 @@ def gradient(x: Tensor) -> Tensor:
     return torch.stack((along_u, along_v), dim=1)
 
 
-def divergence(p: Tensor) -> Tensor:
-    """Return minus the adjoint of :func:`gradient`, (B, 2, C, H, W) -> (B, C, H, W)."""
-    return sum_adjacent(p, -1)
-
-
-def sum_adjacent(p: Tensor, sign: int = 1) -> Tensor:
-    """Return at each pixel the sum of p for the differences that use it, (B, C, H, W), by ``sign`` at the second."""
+def divergence(p: Tensor, sign: int = -1) -> Tensor:
+    """Return minus the adjoint of :func:`gradient`, (B, 2, C, H, W) -> (B, C, H, W); sign 1: of its absolute values."""
     total = torch.zeros_like(p[:, 0])
     for direction, dim in ((0, -1), (1, -2)):
         count = p.shape[dim] - 1

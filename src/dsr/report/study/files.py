@@ -17,13 +17,10 @@ from dsr.utils.guards import natural_key, read_limited
 from dsr.utils.ratios import as_ratio
 from dsr.utils.validation import Number, Whole, describe
 
-PAGE_VERSION = 1
-"""Version of the page and of the answer files that it writes."""
+PAGE_VERSION = 1  # version of the page and of the answer files that it writes
 KEY_NAME = "key.json"
-_LONGEST = 1e12
-"""Maximum time of an answer in milliseconds, 30 years."""
-_LARGEST = 10_000_000
-"""Maximum file size, bytes; an answer file has a few thousand."""
+_LONGEST = 1e12  # maximum time of an answer in milliseconds, 30 years
+_LARGEST = 10_000_000  # maximum file size, bytes; an answer file has a few thousand
 
 
 @dataclass(frozen=True)

@@ -22,13 +22,12 @@ from dsr.report.study.files import Answers, Key
 from dsr.utils.guards import MOST_TABLE, read_limited
 from dsr.utils.ratios import as_ratio
 
+# The paper's columns: percentage of answers with a method as most similar, second most similar, or either
 PERCENTAGES = {"user_first": "User 1st", "user_second": "User 2nd", "user_top2": "User Top 2"}
-"""The paper's columns: percentage of answers with a method as most similar, second most similar, or either."""
 PLACE = ("dataset", "scene", "scale", "downsampling", "method", "label")
+# Columns of the table: percentages, and bounds of their 95 % intervals
 COLUMNS = (*PLACE, *PERCENTAGES, "n", *(f"{column}_{bound}" for column in PERCENTAGES for bound in ("low", "high")))
-"""Columns of the table: percentages, and bounds of their 95 % intervals."""
-AVERAGE, ALL = "average", "all"
-"""Scene name of rows of averages, and data set name of averages over all data sets."""
+AVERAGE, ALL = "average", "all"  # scene name of rows of averages, and data set name of averages over all data sets
 _TEXTS = ("dataset", "scene", "downsampling", "label")
 _KEYS = (*_TEXTS, "scale")
 

@@ -23,10 +23,8 @@ from dsr.utils.progress import SILENT, Progress
 from dsr.utils.ratios import as_ratio
 
 PAGE_NAME = "index.html"
-_DIGITS = 12
-"""Digits of a hash that make an id."""
-_FEWEST = 2
-"""Minimum number of methods in a question."""
+_DIGITS = 12  # digits of a hash that make an id
+_FEWEST = 2  # minimum number of methods in a question
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ PROCEDURAL_VERSION = 1  # version of the scenes; it has to be increased whenever
 _PREVIEW_SIZE = 64
 _MIN_DEPTH, _MAX_MEDIAN_DEPTH = 0.25, 10.0
 _LAYOUT_TRIES, _CAMERA_TRIES = 6, 10
+_Box = tuple[Sequence[float], Sequence[float]]  # its corners (3,)
 
 
 class SceneLayout(NamedTuple):
@@ -32,6 +33,11 @@ class SceneLayout(NamedTuple):
     views: Callable[[np.random.Generator], Viewpoint]
     low: Sequence[float]  # (3,) corners of the box in which lamps may hang
     high: Sequence[float]
+
+
+def _from_box(eyes: _Box, targets: _Box, low: float, high: float) -> Callable[[np.random.Generator], Viewpoint]:
+    """Return random cameras in a box that look into another one, with focal lengths from ``low`` to ``high``."""
+    return lambda draw: aim_camera(draw, draw.uniform(*eyes), draw.uniform(*targets), low, high)
 
 
 def room(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
@@ -169,11 +175,7 @@ def portico(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
         floor = reliefs.relief(rng, reliefs.RELIEFS[rng.integers(2)], 16.0, 260)
     scene.add(floor.scale([1, 1, 0.15]).translate(0, 0, -0.7), "stone", 2.0)
     scene.add(box([40, 0.1, 30]).translate(0, back + 3, -5), "wall", 3.0)
-
-    def views(draw: np.random.Generator) -> Viewpoint:
-        eye = draw.uniform([-3.0, -7.0, 0.3], [3.0, -3.6, 2.6])
-        return aim_camera(draw, eye, draw.uniform([-1, 0, 0.6], [1, 0.5, 1.9]), 0.8, 1.5)
-
+    views = _from_box(([-3.0, -7.0, 0.3], [3.0, -3.6, 2.6]), ([-1, 0, 0.6], [1, 0.5, 1.9]), 0.8, 1.5)
     return SceneLayout(views, [-8, -12, 2], [8, -2, 9])
 
 
@@ -190,11 +192,7 @@ def shapes(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
         thing = place_on_ground(thing).translate(0, 0, -0.4).rotate(random_rotation(rng)).scale(rng.uniform(0.5, 1.0))
         scene.add(thing.translate(*place), "any", 0.5)
     furniture.backdrop(rng, scene, rng.uniform(0.7, 1.6), -1.2)
-
-    def views(draw: np.random.Generator) -> Viewpoint:
-        eye = draw.uniform([-0.8, -2.6, -0.3], [0.8, -1.7, 0.9])
-        return aim_camera(draw, eye, draw.uniform([-0.1, 0, -0.1], [0.1, 0, 0.1]), 0.9, 1.8)
-
+    views = _from_box(([-0.8, -2.6, -0.3], [0.8, -1.7, 0.9]), ([-0.1, 0, -0.1], [0.1, 0, 0.1]), 0.9, 1.8)
     return SceneLayout(views, [-2.5, -3, -0.5], [2.5, -0.3, 2.5])
 
 
@@ -211,11 +209,7 @@ def clutter(rng: np.random.Generator, scene: SceneBuilder) -> SceneLayout:
         block = box(rng.uniform([0.4, 0.3, 0.2], [0.9, 0.5, 0.9])).turn(2, rng.uniform(-30, 30))
         scene.add(block.translate((k - 1.5) * 0.6, depth * rng.uniform(0.5, 1.0), 0.0), "print", 0.5)
     furniture.backdrop(rng, scene, depth + rng.uniform(0.3, 0.8), -0.002)
-
-    def views(draw: np.random.Generator) -> Viewpoint:
-        eye = draw.uniform([-0.7, -1.7, 0.3], [0.7, -0.9, 1.3])
-        return aim_camera(draw, eye, draw.uniform([-0.2, 0.2, 0.05], [0.2, 0.4, 0.3]), 1.0, 1.8)
-
+    views = _from_box(([-0.7, -1.7, 0.3], [0.7, -0.9, 1.3]), ([-0.2, 0.2, 0.05], [0.2, 0.4, 0.3]), 1.0, 1.8)
     return SceneLayout(views, [-2, -2, 0.4], [2, 0.4, 2.2])
 
 
