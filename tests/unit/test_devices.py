@@ -209,6 +209,29 @@ def test_inference_of_facets_asks_a_gpu_once_whether_there_are_holes():
     assert operations.count < 700
 
 
+@pytest.mark.parametrize(("net", "breaks"), [(MSGNet, 0), (FacetsUNet, 1)])
+@pytest.mark.filterwarnings("ignore")
+def test_network_is_one_graph_beside_what_differs_from_step_to_step(net, breaks):
+    """Its C++ is not compiled here, which takes minutes."""
+    sample, everything = _sample(), Everything() if net is FacetsUNet else None
+    scene = Scene("set", "hall", sample.rgb, sample.camera, sample.depth)
+    patches = Patches([[scene]], PatchSettings(patch=32), Degradation(4, Downsampling("box")), everything=everything)
+    small = {"width": 8, "deep": 8} if net is FacetsUNet else {}
+    found, batch = [], default_collate([patches[0], patches[1]])
+    torch._dynamo.utils.counters.clear()
+    for compiled in (False, True):
+        torch.manual_seed(0)
+        network = net(4, **small).train()
+        if compiled:
+            network.compile(dynamic=False, backend="aot_eager")
+        answer = network.answer_patches(network.prepare(batch)).disparity
+        answer.sum().backward()
+        found.append([answer.detach(), *(each.grad for each in network.parameters())])
+    for before, after in zip(*found, strict=True):
+        torch.testing.assert_close(after, before, rtol=1e-4, atol=1e-4 * float(before.abs().max() + 1e-9))
+    assert len(torch._dynamo.utils.counters["graph_break"]) == breaks
+
+
 @pytest.mark.parametrize("method", ["facets", "bicubic"])
 def test_any_photo_and_map_are_upsampled_on_a_gpu(method, gpu):
     sample = _sample()

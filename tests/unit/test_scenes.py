@@ -3,9 +3,11 @@
 import contextlib
 import csv
 import dataclasses
+import functools
 import json
 import math
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pandas as pd
@@ -385,6 +387,26 @@ def test_iteration_progress_is_shown_and_stored(tmp_path):
     run(toy_study(tmp_path, method=Iterating()), progress=Recorder(shown))
     assert shown == [("steps", done, 3) for _ in "ab" for done in (1, 2, 3)]
     assert (tmp_path / "iterations" / "a.csv").read_text() == "iteration,objective\n1.0,0.5\n3.0,0.25\n"
+
+
+def test_scenes_of_several_threads_are_predicted_one_at_a_time_and_written_as_one_by_one(tmp_path):
+    class Alone(ToyMethod):
+        at_work = 0
+
+        def __call__(self, sample, progress=None):
+            self.at_work += 1
+            time.sleep(0.01)
+            assert self.at_work == 1
+            self.at_work -= 1
+            return super().__call__(sample)
+
+    content = {name: toy_scene(name, RAMP + number) for number, name in enumerate("abcdefgh")}
+    studies = [toy_study(tmp_path / name, ToySource(**content), Alone()) for name in ("apart", "together")]
+    run(studies[0])
+    with ThreadPoolExecutor(4) as pool:
+        results = dict(zip(content, pool.map(functools.partial(evaluate_scene, studies[1]), content), strict=True))
+    write_tables(studies[1], results)
+    assert rows(tmp_path / "together") == rows(tmp_path / "apart")
 
 
 def test_scene_without_a_solution_is_a_result_and_no_failure_and_its_earlier_prediction_goes(tmp_path):
