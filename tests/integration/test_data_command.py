@@ -58,6 +58,7 @@ def test_dataset_is_fetched_listed_verified_and_not_fetched_twice(mirror, root, 
     assert rows["middlebury2003"].split()[-2:] == ["complete", "noted"]
     assert rows["middlebury2006"].split()[-2:] == ["absent", "unknown"]
     assert rows["tofmark"].split()[-2:] == ["manual", "unknown"]
+    assert rows["lu"].split()[-2:] == ["absent", "pinned"]
 
     assert cli.main(["data", "verify", "middlebury2003"]) == 0
     assert capsys.readouterr() == ("middlebury2003: complete, as recorded\n", "")

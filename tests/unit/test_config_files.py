@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from dsr.utils import configuration
-from dsr.utils.configuration import config_directories, list_choices
+from dsr.utils.configuration import config_directories
 
 CHECKOUT = Path(__file__).resolve().parents[2] / "conf"
 
@@ -20,13 +20,3 @@ def test_configuration_of_an_installed_package_goes_before_that_of_a_checkout(tm
     monkeypatch.setattr(configuration, "_PLACES", (tmp_path,))
     with pytest.raises(ValueError, match="the installation is incomplete"):
         config_directories()
-
-
-def test_own_directories_are_searched_after_the_project_and_add_choices(tmp_path):
-    (tmp_path / "method").mkdir()
-    (tmp_path / "method" / "mine.yaml").touch()
-    directories = config_directories([tmp_path])
-    assert directories == (CHECKOUT, tmp_path)
-    assert {"bicubic", "mine"} <= set(list_choices("method", directories))
-    with pytest.raises(ValueError, match="--config-dir: expected a directory, got"):
-        config_directories([tmp_path / "nowhere"])

@@ -14,7 +14,6 @@ from dsr.data.sunrgbd import FRAMES as SUN_FRAMES
 from dsr.data.sunrgbd import SunRGBD
 from dsr.data.tofmark import SCENES as TOFMARK_SCENES
 from dsr.data.tofmark import ToFMark
-from dsr.methods.recipe import read_recipe
 from dsr.report.paper import published_row
 from dsr.synthetic.simgeo import SCENES as SIMGEO_SCENES
 from dsr.utils.configuration import ConfigError, build
@@ -93,14 +92,6 @@ def test_middlebury_has_the_scenes_of_the_paper_and_none_of_them_is_trained_on(t
     for scene in EVALUATION_2014:
         with pytest.raises(ValueError, match=f"'{scene}' is not there"):
             MiddleburyTrain(str(tmp_path), [scene])
-
-
-@pytest.mark.parametrize(
-    ("method", "range_type"),
-    [("bicubic", "perspective"), ("msg_v", "disparity"), ("facets", "disparity"), ("dip", "orthogonal")],
-)
-def test_method_gets_the_range_type_that_it_was_made_for(method, range_type):
-    assert read_recipe(method).kind.range_type == range_type
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ import contextlib
 import hashlib
 import io
 import json
-import re
 import shutil
 import socket
 import tarfile
@@ -17,7 +16,7 @@ import pytest
 from download_server import DATES, PNG, serving
 from small_files import written
 
-from dsr.cli import data_tasks, main
+from dsr.cli import main
 from dsr.data.download import Collection, Item
 from dsr.data.download.fetching import Checksums, get, lock_directory, state, verify
 from dsr.utils.progress import Progress
@@ -96,19 +95,6 @@ def test_broken_connection_resumes_where_it_stopped(server, tmp_path):
     assert first is None
     assert 100_000 < second <= 200_000 < third <= second + 100_000  # at most a piece that was under way is lost
     assert server.log[-1][2] == len(PNG) - third
-
-
-def test_later_command_resumes_a_partial_file(server, tmp_path):
-    server.cuts = [200_000, 0]
-    one_line(fetched(picture(server), tmp_path), "set/a.png: ", f"{server.url}/a.png: ", "broke off")
-    had = (tmp_path / "set/a.png.part").read_bytes()
-    assert PNG.startswith(had)
-    assert len(had) > 100_000
-    assert not (tmp_path / "set/a.png").exists()
-    assert fetched(picture(server), tmp_path) == []
-    assert server.log[-1] == ("/a.png", f"bytes={len(had)}-", len(PNG) - len(had))
-    assert (tmp_path / "set/a.png").read_bytes() == PNG
-    assert left_in(tmp_path) == ["set/a.png"]
 
 
 @pytest.mark.parametrize(
@@ -415,33 +401,6 @@ def test_second_command_is_refused_while_one_writes(server, tmp_path):
     with lock_directory(tmp_path), pytest.raises(ValueError, match="another `dsr data` command"):
         fetched(picture(server), tmp_path)
     assert fetched(picture(server), tmp_path) == []
-
-
-def test_list_shows_which_checksums_are_pinned_noted_and_unknown(server, tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("DSR_DATA", str(tmp_path))
-    server.files |= {"/b.png": PNG, "/c.png": PNG}
-    items = [replace(picture(server, f"/{name}.png", name=f"{name}.png"), sha256=digest)
-             for name, digest in (("a", sha256(PNG)), ("b", None), ("c", None))]  # fmt: skip
-
-    def of(items, name):
-        return Collection(name, "A set", "", "", "", ("set",), None, tuple(items))
-
-    catalogue = {name: of(some, name) for name, some in (("all", items), ("one", items[:1]), ("two", items[1:2]))}
-    catalogue["mine"] = replace(
-        catalogue["one"], items=(), manual="put it there", patterns=("*.png",), folders=("mine",)
-    )
-    monkeypatch.setattr(data_tasks, "downloads", lambda: catalogue)
-
-    def listed():
-        assert main(["data", "list"]) == 0
-        return [re.split(r" {2,}", line.strip())[-1] for line in capsys.readouterr().out.splitlines()[1:]]
-
-    assert listed() == ["1 pinned, 2 unknown", "pinned", "unknown", "unknown"]
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "x.png").write_bytes(PNG)
-    assert main(["data", "get", "two", "mine", "--yes"]) == 0
-    capsys.readouterr()
-    assert listed() == ["1 pinned, 1 noted, 1 unknown", "pinned", "noted", "noted"]
 
 
 @pytest.mark.parametrize("given", ["mirror.example/x", "ftp://mirror.example", "https://me:s3cret@mirror.example/x"])

@@ -122,14 +122,6 @@ def test_calibration_compares_expected_and_measured_errors_of_all_scenes(make_ru
     assert len(row["angle"]["ratios"]) == 10
 
 
-def test_limits_of_errors_and_depth_are_the_same_for_all_methods(make_run, tmp_path):
-    runs = [make_run(tmp_path / "runs" / name, method=name, label=name) for name in ("a", "b")]
-    _, _, scene = saved(tmp_path, load_results(runs))
-    assert [surface["label"] for surface in scene["surfaces"]] == ["input", "a", "b", "truth"]
-    assert scene["error"]["limit"] <= scene["error"]["largest"]
-    assert not any("limit" in surface["error"] for surface in scene["surfaces"][1:3])
-
-
 def test_large_pictures_are_reduced_and_the_page_says_so(make_run, tmp_path):
     workers = WorkerPool(load_results([make_run(tmp_path / "run", size=64)]))
     notes = save_page(tmp_path / "small.html", Pictures(workers, 20))
@@ -137,15 +129,6 @@ def test_large_pictures_are_reduced_and_the_page_says_so(make_run, tmp_path):
     assert notes[0] in json.loads(blocks(tmp_path / "small.html")["data"])["notes"]
     assert json.loads(blocks(tmp_path / "small.html")["s0"])["surfaces"][1]["size"] == [16, 16]
     assert save_page(tmp_path / "large.html", Pictures(workers))[0].startswith("pictures: lossless, 8 bits;")
-
-
-def test_pictures_of_many_surfaces_are_smaller_unless_a_size_is_given(make_run, tmp_path, monkeypatch):
-    workers = WorkerPool(load_results([make_run(tmp_path / "run", size=64)]))
-    assert Pictures(workers).longest == 1024
-    monkeypatch.setattr("dsr.report.page._MOST_PIXELS", 300)
-    surfaces = 3 * len(Pictures(workers).places)
-    assert Pictures(workers).longest == math.isqrt(300 // surfaces)
-    assert Pictures(workers, 512).longest == 512
 
 
 def test_reduced_values_are_averages_of_valid_pixels():
