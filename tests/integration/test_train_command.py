@@ -7,14 +7,13 @@ import os
 import re
 import shutil
 import signal
-import time
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
 from bombs import Trap
-from commands import Program, run_python
+from commands import run_python
 from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
@@ -267,28 +266,6 @@ def test_interrupted_training_gives_bit_identical_weights_and_logs(whole, tmp_pa
     for tag in ("val/RMSE_v", "train/loss", "train/learning_rate"):
         assert scalars_of(tmp_path / "out", tag) == scalars_of(whole, tag), tag
     assert sorted(path.name for path in (tmp_path / "out" / "checkpoints").iterdir()) == ["best.ckpt", "last.ckpt"]
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize(("number", "returned"), [(signal.SIGKILL, -9), (signal.SIGTERM, 143)])
-def test_stopped_training_goes_on_from_its_checkpoint(tmp_path, within, number, returned):
-    many = (*SMOKE, "trainer.max_steps=24", "trainer.val_check_interval=4")
-    with Program(TRAIN, *many, "output_dir=out", cwd=tmp_path) as process:
-        deadline = time.monotonic() + 60
-        while not (tmp_path / "out/checkpoints/last.ckpt").exists() and time.monotonic() < deadline:
-            time.sleep(0.02)
-        process.send_signal(number)
-        _, errors = process.communicate(timeout=60)
-    assert process.returncode == returned
-    if number == signal.SIGTERM:
-        step = last_step(tmp_path / "out")
-        assert errors.splitlines()[-1] == f"interrupted at step {step}; resume=out continues from there"
-    assert not (tmp_path / "out" / "weights.safetensors").exists()
-    code, output, errors = within("resume=out")
-    assert (code, errors, "resumed" in output) == (0, [], True)
-    assert within(*many, "output_dir=whole")[0] == 0
-    assert same_weights(tmp_path / "out", tmp_path / "whole")
-    assert validations_of(tmp_path / "out") == validations_of(tmp_path / "whole")
 
 
 def test_loggers_log_to_each_and_none_is_none(tmp_path, within, stop):

@@ -15,7 +15,7 @@ from small_files import encoded_png as png
 from small_files import png_by_its_specification, written
 
 from dsr.data import arkitscenes, icl, sintel, sunrgbd, tartanair
-from dsr.data.eight_bit import NOTE, EightBit
+from dsr.data.eight_bit import EightBit
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import to_range
 
@@ -212,26 +212,6 @@ def test_bicubic_row_of_the_field_comes_out_on_lu(shared, scale, expected):
         levels = np.asarray(levels_lr.resize((width, height), Image.Resampling.BICUBIC)).clip(0, 255)
         errors.append(np.sqrt(np.mean((levels - sample.unit.convert(sample.depth)[0].numpy()) ** 2)))
     assert np.mean(errors) == pytest.approx(expected, abs=1e-3)
-
-
-def test_thirty_pairs_of_middlebury_are_read(shared):
-    data = EightBit(str(shared / "modern"), "middlebury8")
-    assert len(data.scenes()) == 30
-    scene = data.load("Middlebury_30")
-    assert scene.notes == (NOTE,)
-    assert tuple(scene.depth.shape) == (1, 381, 432)
-    levels = scene.unit.convert(scene.depth)
-    assert (levels.min().item(), levels.max().item()) == pytest.approx((24, 134))
-
-
-def test_real_frames_of_rendered_sets_are_read(shared):
-    [files] = tartanair.find_frames(shared / "real/tartanair").values()
-    depth = tartanair.load_frame(*files, "tartanair", "000000").depth
-    assert not depth.isnan().any()
-    assert depth.median().item() == pytest.approx(1.838, abs=0.001)
-    folder = shared / "real/icl_nuim/living"
-    depth = icl.load_frame(folder / "rgb.png", folder / "depth.png", "icl_nuim", "living").depth
-    assert (depth.min().item(), depth.max().item()) == (1.641, 3.43)
 
 
 def test_depth_of_sun_rgbd_is_the_sensors_or_the_refined_one_of_one_picture_each(tmp_path, capfd):

@@ -6,7 +6,6 @@ import pytest
 import yaml
 
 from dsr.data.icl import FRAMES as ICL_FRAMES
-from dsr.data.icl import ICL
 from dsr.data.middlebury import EVALUATION_2014, TRAINING, Middlebury, MiddleburyLevels, MiddleburyTrain
 from dsr.data.rendered import Procedural, SimGeo
 from dsr.data.scene_source import Preparation
@@ -112,23 +111,3 @@ def test_middlebury_has_the_scenes_of_the_paper_and_none_of_them_is_trained_on(t
 def test_values_out_of_range_are_refused(tmp_path, make, message):
     with pytest.raises(ValueError, match=f"^{message}"):
         make(str(tmp_path))
-
-
-def test_real_scenes_of_every_dataset_are_prepared(shared, dsr_cache):
-    real = shared / "real"
-    sources = [
-        Middlebury(str(real / "middlebury2014"), ["recycle"], 64),
-        MiddleburyLevels(str(real / "middlebury2006"), 2006, ["aloe"], 64),
-        ICL(str(real / "icl_nuim"), ["office_0000"], 64),
-        SunRGBD(str(real / "sunrgbd"), ["img_0063"], 64),
-    ]
-    for data in sources:
-        [name] = data.scenes()
-        scene = data.load(name)
-        assert (scene.name, tuple(scene.depth.shape), tuple(scene.rgb.shape)) == (name, (1, 64, 64), (3, 64, 64))
-        assert 0.5 < scene.depth.nanmedian() < 12
-    devil = ToFMark(str(real / "tofmark"), depth_range=[0.4, 0.9]).load("devil")
-    assert tuple(devil.measured[8].shape) == (1, 76, 101)
-    assert (devil.camera.fx, devil.notes) == (549.2, ("the benchmark has no camera: it is an estimate",))
-    given = ToFMark(str(real / "tofmark"), None, [600.0, 600.0, 404.5, 304.5], [0.4, 0.9]).load("devil")
-    assert (given.camera.fx, given.notes) == (600.0, ())

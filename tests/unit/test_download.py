@@ -8,16 +8,17 @@ import shutil
 import socket
 import tarfile
 import zipfile
-from collections import namedtuple
+from collections import Counter, namedtuple
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from urllib.parse import urlsplit
 
 import pytest
 from download_server import DATES, PNG, serving
 from small_files import written
 
 from dsr.cli import main
-from dsr.data.download import Collection, Item
+from dsr.data.download import CATALOGUE, Collection, Item
 from dsr.data.download.fetching import Checksums, get, lock_directory, state, verify
 from dsr.utils.progress import Progress
 
@@ -411,3 +412,52 @@ def test_mirror_that_is_no_address_or_has_a_password_is_refused(tmp_path, monkey
     [line] = captured.err.splitlines()
     assert "--mirror: expected an address that begins with http" in line
     assert "s3cret" not in captured.out + line
+
+
+# The catalogue
+
+
+ITEMS = [item for collection in CATALOGUE.values() for item in collection.items]
+
+
+def test_collection_has_terms_and_files_in_its_folders_or_says_how_to_get_them():
+    for name, collection in CATALOGUE.items():
+        assert collection.name == name
+        assert all((collection.homepage, collection.title, collection.licence, collection.citation))
+        assert bool(collection.items) != bool(collection.manual and collection.patterns)
+        paths = [item.path for item in collection.items]
+        assert {path.split("/")[0] for path in paths} == (set(collection.folders) if paths else set())
+        assert len(set(paths)) == len(paths)
+
+
+def test_items_have_addresses_of_their_names_and_paths_below_the_root():
+    assert len(ITEMS) > 200
+    for item in ITEMS:
+        assert not PurePosixPath(item.path).is_absolute()
+        assert ".." not in item.path
+        assert item.urls
+        for url in item.urls:
+            address = urlsplit(url)
+            assert address.scheme in ("http", "https")
+            assert " " not in url
+            name = (address.fragment or address.path).rpartition("/")[2]
+            assert name == PurePosixPath(item.path).name or item.unpack_to is not None
+        assert (item.unpack_to is None) == (not item.path.endswith((".zip", ".tar.gz")))
+        assert bool(item.contains) == (item.unpack_to is not None)
+
+
+def test_files_of_a_commit_are_pinned_and_the_shared_ones_are_these(shared):
+    pinned = {item.path: item.sha256 for item in ITEMS if item.sha256 is not None}
+    counts = Counter(path.split("/")[0] for path in pinned)
+    assert counts == {
+        "lu": 2 * 6, "middlebury8": 2 * 30, "ddrnet": 3 * 22, "stereo_board": 2 * 5, "cleargrasp": 4 * 4 + 1,
+        "cleargrasp_synthetic": 3 * 3,
+    }  # fmt: skip
+    for item in ITEMS:
+        assert (item.sha256 is not None) == ("raw.githubusercontent.com" in item.urls[0])
+    folders = (("lu", "modern/Lu"), ("middlebury8", "modern/Middlebury"), ("stereo_board", "real/stereo_board"))
+    for ours, theirs in folders:
+        for path, digest in pinned.items():
+            folder, _, name = path.partition("/")
+            if folder == ours:
+                assert hashlib.sha256((shared / theirs / name).read_bytes()).hexdigest() == digest

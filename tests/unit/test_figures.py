@@ -142,17 +142,6 @@ def test_scores_are_in_thousandths_and_the_best_is_bold(results, drawn, tmp_path
     assert [text.get_weight() == "bold" for text in captions[:3]] == [value == min(shown) for value in shown]
 
 
-def test_results_that_cannot_be_drawn_are_left_out_with_a_note(results, drawn, tmp_path):
-    change(tmp_path / "runs" / "a" / "predictions" / "one.npz", depth=np.ones((7, 24)))
-    (tmp_path / "runs" / "b" / "predictions" / "one.npz").write_bytes(b"damaged")
-    notes = []
-    save_grids(tmp_path, results, "depth", notes=notes)
-    assert len(notes) == 2
-    assert any("expected maps of the photo's 24 x 24 pixels, got 7 x 24" in note for note in notes)
-    assert any(str(tmp_path / "runs" / "b" / "predictions" / "one.npz") in note for note in notes)
-    assert len(empty_panels(drawn["depth_simgeo_x4_box_1"], "one")) == 2
-
-
 def test_figure_of_lights_shows_their_closed_form(drawn, tmp_path):
     lights_figure.save_lights_figure(tmp_path)
     [figure] = drawn.values()

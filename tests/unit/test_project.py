@@ -1,8 +1,14 @@
 """What a contributor reads: its paths are there, its forms are whole, its versions are those of the code."""
 
+import doctest
+import importlib
 import re
 from pathlib import Path
 
+import pytest
+from module_graph import MODULES
+
+import dsr
 from dsr.methods import weights
 from dsr.utils.versions import RESULTS, SCENES
 
@@ -22,3 +28,18 @@ def test_paths_of_contributing_exist():
     paths = re.findall(r"`((?:src|tests|conf)/[\w*./]+)`", text) + re.findall(r"\]\((\w[\w./]+)", text)
     assert len(paths) > 10
     assert [path for path in paths if "NAME" not in path and not list(REPOSITORY.glob(path))] == []
+
+
+WITH_EXAMPLES = sorted(name for name, path in MODULES.items() if ">>>" in path.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("name", WITH_EXAMPLES)
+def test_examples_of_a_module_run(name, dsr_cache):
+    result = doctest.testmod(importlib.import_module(name))
+    assert result.attempted > 0
+    assert result.failed == 0
+
+
+@pytest.mark.parametrize("name", sorted({*dsr.__all__} - {"__version__"}))
+def test_each_name_of_the_package_has_an_example(name):
+    assert "Example:" in getattr(dsr, name).__doc__
