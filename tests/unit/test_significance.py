@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy.stats import binomtest, bootstrap, permutation_test
+from scipy.stats import bootstrap, permutation_test
 
-from dsr.report.significance import agreement, bootstrap_of_average, interval_of_mean, p_of_difference, wilson
+from dsr.report.significance import interval_of_mean, p_of_difference
 
 
 def test_interval_of_many_scenes_is_that_of_another_bootstrap() -> None:
@@ -38,26 +38,3 @@ def test_scenes_are_paired() -> None:
     assert p_of_difference(better, random.permutation(worse)) > 0.05
     assert p_of_difference(better, worse) == p_of_difference(worse, better)
     assert p_of_difference(better, better) == 1
-
-
-@pytest.mark.parametrize(("count", "n"), [(0, 1), (1, 1), (0, 136), (3, 136), (5, 10), (136, 136)])
-def test_wilson_interval_equals_scipy(count, n):
-    theirs = binomtest(count, n).proportion_ci(0.95, method="wilson")
-    assert wilson(count, n) == pytest.approx((theirs.low, theirs.high), abs=1e-12)
-
-
-def test_interval_of_an_average_is_wilsons_with_one_answer_a_person_where_all_agree():
-    ones = np.ones((12, 5), int)
-    assert bootstrap_of_average(ones, ones) == pytest.approx(wilson(12, 12))
-    assert bootstrap_of_average(0 * ones, ones) == pytest.approx(wilson(0, 12))
-    low, high = bootstrap_of_average(np.tile([1, 0], (5, 1)), np.ones((5, 2), int))  # one scene of two
-    assert low + high == pytest.approx(1)
-
-
-def test_agreement_equals_fleiss_own_example():
-    """Ten subjects, fourteen raters, five categories: 0.378 and kappa 0.210."""
-    counts = [
-        [0, 0, 0, 0, 14], [0, 2, 6, 4, 2], [0, 0, 3, 5, 6], [0, 3, 9, 2, 0], [2, 2, 8, 1, 1],
-        [7, 7, 0, 0, 0], [3, 2, 6, 3, 0], [2, 5, 3, 2, 2], [6, 5, 2, 1, 0], [0, 2, 2, 3, 7],
-    ]  # fmt: skip
-    assert agreement(np.array(counts)) == pytest.approx((0.378, 0.210), abs=5e-4)

@@ -19,6 +19,7 @@ from dsr.cli import main
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.camera import Camera
 from dsr.pictures.depth_views import rendering
+from dsr.report.significance import agreement, bootstrap_of_average, wilson
 from dsr.report.study import Choice
 from dsr.report.study.files import Candidate, Key, Trial, files_of, read_all, read_answers, read_key, write_key
 from dsr.report.study.percentages import ALL, AVERAGE, COLUMNS, collect, remarks
@@ -67,6 +68,29 @@ def row(table, dataset, scene, label):
 
 GIVEN = {"p1": ("VB", "VD"), "p2": ("VB", "BV"), "p3": ("VD", "BV"), "p4": ("BV", "VB")}
 FOUR = tuple(answers(person, *choices) for person, choices in GIVEN.items())
+
+
+@pytest.mark.parametrize(("count", "n"), [(0, 1), (1, 1), (0, 136), (3, 136), (5, 10), (136, 136)])
+def test_wilson_interval_equals_scipy(count, n):
+    theirs = binomtest(count, n).proportion_ci(0.95, method="wilson")
+    assert wilson(count, n) == pytest.approx((theirs.low, theirs.high), abs=1e-12)
+
+
+def test_interval_of_an_average_is_wilsons_with_one_answer_a_person_where_all_agree():
+    ones = np.ones((12, 5), int)
+    assert bootstrap_of_average(ones, ones) == pytest.approx(wilson(12, 12))
+    assert bootstrap_of_average(0 * ones, ones) == pytest.approx(wilson(0, 12))
+    low, high = bootstrap_of_average(np.tile([1, 0], (5, 1)), np.ones((5, 2), int))  # one scene of two
+    assert low + high == pytest.approx(1)
+
+
+def test_agreement_equals_fleiss_own_example():
+    """Ten subjects, fourteen raters, five categories: 0.378 and kappa 0.210."""
+    counts = [
+        [0, 0, 0, 0, 14], [0, 2, 6, 4, 2], [0, 0, 3, 5, 6], [0, 3, 9, 2, 0], [2, 2, 8, 1, 1],
+        [7, 7, 0, 0, 0], [3, 2, 6, 3, 0], [2, 5, 3, 2, 2], [6, 5, 2, 1, 0], [0, 2, 2, 3, 7],
+    ]  # fmt: skip
+    assert agreement(np.array(counts)) == pytest.approx((0.378, 0.210), abs=5e-4)
 
 
 def test_percentages_of_a_scene_equal_a_count_by_hand(tmp_path):
