@@ -75,6 +75,10 @@ def stop(monkeypatch):
     return at
 
 
+def defective(*_):
+    raise RuntimeError("defective")
+
+
 def tree(folder):
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
 
@@ -245,7 +249,9 @@ def test_logger_that_is_not_installed_is_named_before_anything_is_written(tmp_pa
         pytest.param(2, "validation_step", marks=pytest.mark.nightly),
     ],
 )
-def test_interrupted_training_gives_bit_identical_weights_and_logs(whole, tmp_path, within, stop, step, method):
+def test_interrupted_training_gives_bit_identical_weights_and_logs(
+    whole, tmp_path, within, stop, monkeypatch, capfd, step, method
+):
     handler = signal.getsignal(signal.SIGINT)
     stop(step, method)
     code, output, errors = within(*FOUR, "output_dir=out")
@@ -257,6 +263,12 @@ def test_interrupted_training_gives_bit_identical_weights_and_logs(whole, tmp_pa
     if step:
         (tmp_path / "out").rename(tmp_path / "moved")
         (tmp_path / "out").symlink_to("moved")
+    if method == "loss_terms":
+        with monkeypatch.context() as patch:
+            patch.setattr(SuperResolution, "loss_terms", defective)
+            with pytest.raises(RuntimeError, match="defective"):  # which is not taken for a damaged checkpoint
+                within("resume=out")
+        capfd.readouterr()
     code, output, errors = within("resume=out") if step else within(*FOUR, "output_dir=out")
     assert (code, errors) == (0, [])
     assert ("resumed" in output) == (step > 0)
@@ -313,6 +325,7 @@ def state_of_best(checkpoint):
 
 
 REFUSED = {
+    "something else": dict.clear,
     "an object": lambda checkpoint: checkpoint.update(hyper_parameters=Trap(Path("executed"))),
     "files elsewhere": lambda checkpoint: state_of_best(checkpoint).update(
         best_k_models={f"{state_of_best(checkpoint)['dirpath']}/../../mine": torch.ones(())}

@@ -714,11 +714,7 @@ def test_documentation_has_the_table_of_captures():
 def test_command_prints_the_captures_with_a_word(capsys):
     assert main(["formats", "r3d"]) == 0
     printed = capsys.readouterr().out
-    assert "Record3D" in printed
-    assert "Polycam" not in printed
-    for word in ("found", "tried", "sensor "):  # labels of the rows
-        assert main(["formats", word]) in (0, 2)
-        assert "Polycam" not in capsys.readouterr().out
+    assert ("Record3D" in printed, "Polycam" in printed) == (True, False)
     assert main(["formats"]) == 0
     printed = capsys.readouterr().out
     assert all(each.name in printed for each in registry.CAPTURES)

@@ -15,7 +15,6 @@ import bombs
 import captures
 import cv2
 import h5py
-import lightning
 import numpy as np
 import pytest
 import safetensors.torch
@@ -23,7 +22,6 @@ import scipy.io
 import torch
 from single_files import READERS, read_capture, read_picture_file
 from small_results import write_result
-from torch.utils.data import DataLoader
 
 from dsr.app.upsample.outputs import ResultFolder
 from dsr.app.upsample.stored import read_exports, read_info, read_result
@@ -51,7 +49,6 @@ from dsr.report.surface_page import is_view
 from dsr.sample import DepthSample
 from dsr.utils import guards
 from dsr.utils.arrays import read_arrays
-from dsr.utils.checkpoints import fit, make_trainer
 from dsr.utils.console import one_line, print_error, printable
 from dsr.utils.guards import TooLargeError, is_number, parse_json, read_limited
 
@@ -393,38 +390,6 @@ def test_weights_without_plain_values_are_refused(tmp_path, tensor):
     assert "expected a torch file" in refusal(path, read_tensors, path)
     torch.save({"model_state_dict": {"a": tensor}}, path)
     assert "expected a torch file" in refusal(path, load_msg_weights, path, 4)
-
-
-class OneWeight(lightning.LightningModule):
-    """A training of one number, whose second step is defective."""
-
-    def __init__(self):
-        super().__init__()
-        self.weight = torch.nn.Parameter(torch.zeros(1))
-
-    def training_step(self, batch, number):
-        if self.global_step:
-            raise RuntimeError("defective")
-        return (self.weight - batch).square().sum()
-
-    def configure_optimizers(self):
-        return torch.optim.SGD(self.parameters(), 0.1)
-
-
-@pytest.mark.parametrize("content", [{"state_dict": {}}, [1], None])
-def test_checkpoint_of_something_else_is_refused_and_a_defect_is_not_taken_for_one(tmp_path, content):
-    path = tmp_path / "last.ckpt"
-    trainers = [make_trainer(torch.device("cpu"), steps, 1, callbacks=[], logger=False, default_root_dir=tmp_path)
-                for steps in (1, 2)]  # fmt: skip
-    numbers = DataLoader(torch.ones(2, 1), batch_size=None)
-    fit(trainers[0], OneWeight(), numbers)
-    trainers[0].save_checkpoint(path)
-    if content is None:
-        with pytest.raises(RuntimeError, match="defective"):
-            fit(trainers[1], OneWeight(), numbers, path)
-        return
-    torch.save(content, path)
-    assert ": expected a checkpoint of this training" in refusal(path, fit, trainers[1], OneWeight(), numbers, path)
 
 
 def external(file, secret):

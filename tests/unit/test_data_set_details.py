@@ -269,14 +269,6 @@ def test_nyu_crop_starts_at_column_40_and_row_44_as_its_intrinsics_say(shared):
     assert (counted_from_0[0] - best[0], counted_from_0[1] - best[1]) == pytest.approx((camera.cx, camera.cy))
 
 
-def test_pair_of_loose_files_is_read_with_intrinsics(shared):
-    folder = shared / "real/sunrgbd/open3d_sample"
-    scene = sunrgbd.load_pair(
-        folder / "SUN_color.jpg", folder / "SUN_depth.png", "sunrgbd", "sample", (570, 570, 320, 240)
-    )
-    assert scene.depth.nan_to_num(0).max().item() == 9.870  # beyond 8 m, not cut
-
-
 def test_scenes_behind_links_are_found_and_circular_links_are_harmless(tmp_path):
     for part in ("image", "depth"):
         (tmp_path / "elsewhere" / "one" / part).mkdir(parents=True)

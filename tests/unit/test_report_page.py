@@ -183,15 +183,6 @@ def test_result_whose_expected_errors_do_not_fit_is_shown_without_them(make_run,
     assert any("cube_no_texture" in note for note in data["notes"])
 
 
-def test_scene_without_truth_has_renderings_and_no_errors(make_run, tmp_path):
-    [run] = load_results([make_run(tmp_path / "run")]).runs
-    stored = dataclasses.replace(run.sample("cube_no_texture"), depth=None)
-    _, _, scene = saved(tmp_path, Results((changed(run, sample=lambda _: stored),)))
-    assert [surface["kind"] for surface in scene["surfaces"]] == ["input", "method"]
-    assert "error" not in scene
-    assert "error" not in scene["surfaces"][1]
-
-
 # The standings
 
 
