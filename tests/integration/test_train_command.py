@@ -375,13 +375,13 @@ def test_mixtures_validate_with_each_part_and_evaluation_of_the_run_gives_the_sc
         "dataset=mixture", "noise=gaussian_multiplicative", "noise.std=0.01", "seed=3", "keep=last",
         "dataset.parts.procedural.count=2", "dataset.parts.procedural.size=64",
         "~dataset.parts.folder", "~dataset.shares.folder",
-        "+dataset@dataset.parts.other=procedural", "dataset.parts.other.count=6", "dataset.parts.other.size=64",
+        "+dataset@dataset.parts.other=procedural", "dataset.parts.other.count=3", "dataset.parts.other.size=64",
         "dataset.parts.other.seed=1", "+dataset.shares.other=0.5", "+dataset@validation.mine=procedural",
         "validation.mine.count=1", "validation.mine.size=64", "validation.mine.seed=9",
     )  # fmt: skip
     assert (code, errors) == (0, [])
     sets = ("procedural", "procedural_2", "mine")
-    assert f"data   6 scenes of mixture to train on, {', '.join(f'1 of {each}' for each in sets)} to vali" in output
+    assert f"data   3 scenes of mixture to train on, {', '.join(f'1 of {each}' for each in sets)} to vali" in output
     scores = {(kind, name): value for (step, kind, name), value in validations_of(tmp_path / "out").items() if step}
     assert {kind for kind, _ in scores} == {f"{what}{each}" for what in ("val", "bicubic") for each in
                                             ("", *(f"_{name}" for name in sets))}  # fmt: skip

@@ -167,7 +167,7 @@ REAL = [
     (NYU, "modern/NYU", {"split": "test"}, 3, "1001", (480, 640), [2.962]),
     (Middlebury, "real/middlebury2014", {"size": None}, 10, "artl", (277, 347), [1.776]),
     (MiddleburyLevels, "real/middlebury2006", {"year": 2006, "size": None}, 8, "aloe", (370, 427), [2.308]),
-    (MiddleburyLevels, "real/middlebury2005", {"year": 2005, "size": None}, 3, "art", (1088, 1376),
+    (MiddleburyLevels, "real/middlebury2005", {"year": 2005, "size": None, "smooth": False}, 3, "art", (1088, 1376),
      [1.776, 1.786, 1.786]),
     (SunRGBD, "real/sunrgbd", {"size": None}, 2, "img_0063", (427, 561), [1.963]),
     (ToFMark, "real/tofmark", TOFMARK, 3, "devil", (610, 810), [0.757, 0.763]),

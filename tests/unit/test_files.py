@@ -191,7 +191,7 @@ def test_evaluation_writes_through_no_link_in_the_directory_of_its_run(tmp_path,
         path = tmp_path / "disk" / "run" / name
         kept = path.rename(tmp_path / place) if path.exists() else None
         path.symlink_to(tmp_path / place)
-        for more in ([], ["overwrite=true"]):
+        for more in ([], ["overwrite=true"])[: 2 if name == "predictions" else 1]:
             with pytest.raises(SystemExit):
                 main([*given, *more])
             line = capsys.readouterr().err.splitlines()[-1]
