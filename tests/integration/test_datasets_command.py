@@ -4,7 +4,6 @@ from pathlib import Path
 
 import cv2
 import pandas as pd
-import pytest
 from commands import run_python
 from upsampling import refused_line
 
@@ -27,20 +26,6 @@ def test_real_scenes_of_several_datasets_are_evaluated_by_one_command(monkeypatc
     assert scores[scores["metric"] == "RMSE_d"]["valid_share"].between(0.6, 1).all()
     pictures = sorted(path.stem for path in tmp_path.glob("outputs/eval/*_icl*/pictures/*.png"))
     assert pictures == ["living", "office_0000"]
-
-
-@pytest.mark.nightly
-def test_training_on_real_scenes_with_holes_and_procedural_ones_runs(monkeypatch, tmp_path, shared):
-    monkeypatch.setenv("DSR_DATA", str(shared / "real"))
-    done = run_python(
-        str(REPOSITORY / "train.py"), "dataset=paper_train", "trainer=smoke", "output_dir=out", "patches.scenes=4",
-        "dataset.parts.middlebury_train.scenes=found", "dataset.shares.sintel=0",
-        "dataset.parts.procedural.count=2", "dataset.parts.procedural.size=64", *QUICK, cwd=tmp_path,
-    )  # fmt: skip
-    assert (done.returncode, done.stderr) == (0, "")
-    split = "data   4 scenes of paper_train to train on, 1 of middlebury_train, 1 of procedural to validate with"
-    assert split in done.stdout
-    assert (tmp_path / "out" / "weights.safetensors").is_file()
 
 
 def test_prepare_draws_a_contact_sheet_and_errors_are_one_line(tmp_path, monkeypatch, capsys, shared, dsr_cache):

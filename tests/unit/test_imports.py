@@ -1,8 +1,5 @@
 """Imports run downward only; see docs/architecture.md."""
 
-import importlib
-import re
-
 from module_graph import LAYERS, MODULES, SOURCE, drawing, import_graph, within
 
 ARCHITECTURE = SOURCE.parent / "docs" / "architecture.md"
@@ -91,22 +88,3 @@ def test_modules_do_not_import_each_other_in_a_circle():
 
 def test_documentation_shows_the_rooms_as_they_are():
     assert f"```text\n{drawing()}```\n" in ARCHITECTURE.read_text(encoding="utf-8"), "run tests/module_graph.py"
-
-
-def test_what_the_page_of_the_architecture_names_is_there():
-    text = ARCHITECTURE.read_text(encoding="utf-8")
-    names = set(re.findall(r"`(dsr\.[\w.]+)`", text))
-    files = set(re.findall(r"`((?:src|conf|tests|docs|benchmarks)/[\w./]+)`", text))
-    assert len(names) > 20
-    for name in sorted(names):
-        module = next(part for part in accumulated(name) if part in MODULES)
-        found = importlib.import_module(module)
-        for part in name.removeprefix(module).strip(".").split(".") if name != module else ():
-            found = getattr(found, part)
-    assert sorted(file for file in files if not (SOURCE.parent / file).exists()) == []
-
-
-def accumulated(name):
-    """Return a dotted name and what stands before each of its dots, the longest first."""
-    parts = name.split(".")
-    return [".".join(parts[:count]) for count in range(len(parts), 0, -1)]
