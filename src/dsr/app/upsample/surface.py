@@ -213,7 +213,7 @@ class Surface(Generic[Array]):
             content = hashlib.sha256(self._found.depth.numpy().tobytes() + as_bytes(self._picture.rgb).tobytes())
             inputs = {"surface": {"sha256": content.hexdigest()}}  # which a folder of results has for its inputs
             path, limit = wanted.output, wanted.max_error / 100
-            results = ResultFolder(path, inputs, {"max_error": limit}, overwrite=wanted.overwrite)
+            results = ResultFolder(path, inputs, {"max_error": limit}, wanted)
             results.expect_agreement("take another folder, or overwrite=True")
             results.expect_free()
             found = self._found.without_dubious(limit) if wanted.certain else self._found
