@@ -97,7 +97,7 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
 def _faces(inverse: np.ndarray, allowed: np.ndarray | None) -> tuple[np.ndarray, int]:
     """Return the triangles of a map of inverse depth, (H, W), as (M, 3) indices, and how many there are of all."""
     height, width = inverse.shape
-    across, down = find_connections(inverse)
+    across, down = find_connections(inverse), find_connections(inverse.T).T
     top, bottom, left, right = across[:-1], across[1:], down[:, :-1], down[:, 1:]
     falling = np.abs(inverse[:-1, :-1] - inverse[1:, 1:])  # from the upper left pixel to the lower right one
     rising = np.abs(inverse[1:, :-1] - inverse[:-1, 1:])
@@ -200,13 +200,11 @@ def _leaves(needed: np.ndarray, rows: int, columns: int) -> tuple[np.ndarray, np
     return np.concatenate(done, axis=1).T, corners.T
 
 
-def find_connections(inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether each pixel of inverse depth, (H, W), is on one surface with its right and its lower neighbour."""
-    return _connected(inverse), _connected(inverse.T).T
+def find_connections(inverse: np.ndarray) -> np.ndarray:
+    """Return whether each pixel of inverse depth, (H, W), is on one surface with its right neighbour, (H, W - 1) bool.
 
-
-def _connected(inverse: np.ndarray) -> np.ndarray:
-    """Return whether each pixel and its right neighbour lie on one surface, (H, W - 1) bool; False beside holes."""
+    Beside holes none is.
+    """
     width, widest = inverse.shape[1], 2 * max(_HALF_WIDTHS)
     rows, found = max(1, _STRIP // width), []
     for start in range(0, len(inverse), rows):

@@ -106,6 +106,14 @@ def normal_strips(depth: Tensor, camera: Camera) -> Iterator[tuple[slice, Tensor
         yield slice(start, stop), normals[:, start - first : stop - first]
 
 
+def whole_normals(depth: Tensor, camera: Camera) -> Tensor:
+    """Return the normals of a map, (1, H, W), as (3, H, W) float32, NaN where unknown."""
+    normals = torch.empty((3, camera.height, camera.width))
+    for rows, part in normal_strips(depth, camera):
+        normals[:, rows] = part
+    return normals
+
+
 def write_renderings(folder: Path, depth: Tensor, camera: Camera) -> list[Path]:
     """Write the renderings of a map, (1, H, W), as ``e1.png`` to ``e4.png``, 8 bits of grey, holes transparent."""
     shades = np.zeros((len(LIGHT_NAMES), camera.height, camera.width), np.uint8)

@@ -318,7 +318,7 @@ def _joined_along(depth: np.ndarray, factor: int) -> np.ndarray:
     rows = max(1, _STRIP // (depth.shape[1] * factor))
     for start in range(0, height, rows):
         stop = min(start + rows, height)
-        across, _ = find_connections(1 / depth[start * factor : stop * factor].astype(np.float64))
+        across = find_connections(1 / depth[start * factor : stop * factor].astype(np.float64))
         broken = np.pad(np.cumsum(~across, axis=1), ((0, 0), (1, 0)))  # number of cuts left of each pixel
         middles = factor // 2 + factor * np.arange(width)
         whole = broken[:, middles[1:]] == broken[:, middles[:-1]]

@@ -185,8 +185,8 @@ class Upsampler:
 
         """
         with python_messages():
-            picture = without_repeats(picture_of(rgb, depth, camera, mask=mask, unit=unit))
-            return self._upsample(picture, _device_of(depth), progress=progress)
+            picture, device = _read(rgb, depth, camera, mask=mask, unit=unit)
+            return self._upsample(picture, device, progress=progress)
 
     def stream(
         self, frames: Iterable[tuple[Any, ...]], *, neighbours: int = 4, unit: str | float | None = None
@@ -303,17 +303,18 @@ def _is_empty(picture: Picture) -> bool:
     return bool(picture.depth_lr.isnan().all())
 
 
-def _device_of(depth: Any) -> torch.device | None:
-    """Return the device of a depth map that was given as a tensor."""
-    return depth.device if isinstance(depth, Tensor) else None
+def _read(rgb: Any, depth: Any, camera: Any, **further: Any) -> tuple[Picture, torch.device | None]:
+    """Return a user's arguments as a picture, and the device of the depth map if that is a tensor."""
+    picture = picture_of(rgb, depth, camera, **further)
+    device = depth.device if isinstance(depth, Tensor) else None
+    return picture if _is_empty(picture) else without_repeats(picture), device
 
 
 def _read_frame(frame: Any, number: int, unit: str | float | None) -> tuple[Picture, torch.device | None]:
-    """Return a frame of a stream, and the device of its depth if that is a tensor."""
+    """Return a frame of a stream, see :func:`_read`."""
     with naming(f"frame {number}"), python_messages():
         if not isinstance(frame, tuple | list) or len(frame) not in (3, 4):
             came = f"{len(frame)} of them" if isinstance(frame, tuple | list) else type(frame).__name__
             raise ValueError(f"expected (rgb, depth, camera) or (rgb, depth, camera, pose), got {came}")
         rgb, depth, camera, pose = (*frame, None)[:4]
-        picture = picture_of(rgb, depth, camera, unit=unit, pose=pose, empty=True)
-        return picture if _is_empty(picture) else without_repeats(picture), _device_of(depth)
+        return _read(rgb, depth, camera, unit=unit, pose=pose, empty=True)

@@ -22,7 +22,7 @@ from dsr.geometry.lights import FIGURE_LIGHT, Direction, direction_of
 from dsr.geometry.mesh import Mesh, triangulate, vertex_normals
 from dsr.geometry.surface import render_for_viewing, shade
 from dsr.inference.resizing import Plan
-from dsr.io.exports import as_bytes, normal_strips
+from dsr.io.exports import as_bytes, whole_normals
 from dsr.io.files import python_messages
 from dsr.io.inputs import Picture
 from dsr.io.photos import data_url
@@ -240,9 +240,7 @@ class Surface(Generic[Array]):
         """Return the photo, the depth map that was given, and the surface, both under a light, for a notebook."""
         before = self._picture.depth_lr
         view = self.camera.rescale(before.shape[-1], before.shape[-2])
-        tones: list[np.ndarray] = [
-            render_for_viewing(each[None])[0, 0].numpy() for each in (_normals(before, view), self._normals)
-        ]
+        tones = [render_for_viewing(each[None])[0, 0].numpy() for each in (whole_normals(before, view), self._normals)]
         content = encode_row([self._picture.rgb.permute(1, 2, 0).numpy(), *tones])
         error = float(self._found.depth_error.nanmedian()) if self._found.depth_error is not None else float("nan")
         size = f"{self.camera.width} x {self.camera.height}"
@@ -260,7 +258,7 @@ class Surface(Generic[Array]):
     @functools.cached_property
     def _normals(self) -> Tensor:
         """The normals, (3, H, W)."""
-        return _normals(self._found.depth, self.camera)
+        return whole_normals(self._found.depth, self.camera)
 
     def _certain(self, max_error: float | None) -> Tensor:
         """Return the depth, (1, H, W), without pixels that are likely to be wrong."""
@@ -279,8 +277,3 @@ class Surface(Generic[Array]):
         """Return a map, (1, H, W), as the depth map was given."""
         assert values is not None  # noqa: S101 - AnyRatio estimates what a method does not say
         return cast("Array", values[0].numpy().copy() if self._device is None else values.to(self._device, copy=True))
-
-
-def _normals(depth: Tensor, camera: Camera) -> Tensor:
-    """Return the normals of a depth map, (3, H, W) float32."""
-    return torch.cat([part for _, part in normal_strips(depth, camera)], dim=1)

@@ -23,9 +23,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from dsr.geometry.poses import from_quaternion
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Record, Size, Source, file_state
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult, numbered_files, paired
-from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera, pose_from_quaternion
+from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera
 from dsr.notes import Assumption
 from dsr.utils.decoding import QUIET_DECODERS
 from dsr.utils.guards import expect_pixels, numbers_in, read_text, refusing
@@ -115,7 +116,7 @@ def _geometry(folder: Path, number: int, row: _Row, text: str, size: Size) -> Ge
     camera, pose, notes = None, None, []
     if row:
         values = numbers(_POSE)
-        pose = pose_from_quaternion(place, values[3:], values[:3])
+        pose = from_quaternion(values[:3], values[3:], place)
     else:
         notes.append(Assumption("no pose: odometry.csv has none of the frame"))
     intrinsics: list[float] = []
@@ -156,9 +157,9 @@ class VideoFrame(Source):
 
 
 class _Player:
-    """A video that is open at some frame."""
+    """A video of a :func:`file_state` that is open at some frame."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, _state: tuple[int, int]) -> None:
         self._path = path
         self._open()
 
@@ -197,7 +198,4 @@ class _Player:
         self.capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # intrinsics are those of the pixels as they are stored
 
 
-@functools.lru_cache(maxsize=1)
-def _player(path: Path, _state: tuple[int, int]) -> _Player:
-    """Return the open video."""
-    return _Player(path)
+_player = functools.lru_cache(maxsize=1)(_Player)  # the open video
