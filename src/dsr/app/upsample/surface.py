@@ -240,7 +240,8 @@ class Surface(Generic[Array]):
         """Return the photo, the depth map that was given, and the surface, both under a light, for a notebook."""
         before = self._picture.depth_lr
         view = self.camera.rescale(before.shape[-1], before.shape[-2])
-        tones = [render_for_viewing(each[None])[0, 0].numpy() for each in (whole_normals(before, view), self._normals)]
+        normals = whole_normals(before, view), self._normals
+        tones: list[np.ndarray] = [render_for_viewing(each[None])[0, 0].numpy() for each in normals]
         content = encode_row([self._picture.rgb.permute(1, 2, 0).numpy(), *tones])
         error = float(self._found.depth_error.nanmedian()) if self._found.depth_error is not None else float("nan")
         size = f"{self.camera.width} x {self.camera.height}"

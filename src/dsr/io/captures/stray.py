@@ -75,14 +75,14 @@ def frames_of_video(
 
     They may belong to others if the video has another number of frames than there are maps, which is a warning.
     """
-    frames, warnings = {number: VideoFrame(video, number) for number in depths}, []
+    frames, warnings = {number: VideoFrame(video, f"{number:06}", number) for number in depths}, []
     expected = max(frames) + 1
     with contextlib.suppress(ValueError), _LOCK:  # each frame says so when it is read
         count = int(_player(video, file_state(video, "a video")).capture.get(cv2.CAP_PROP_FRAME_COUNT))
         if count != expected:
             text = f"{video.name} has {count} frames, the depth maps count to {expected}: photos may be some frames off"
             warnings.append(Assumption(text))
-    return {number: video / f"{number:06}" for number in frames}, frames, warnings
+    return {number: video / frame.name for number, frame in frames.items()}, frames, warnings
 
 
 def _read_odometry(path: Path) -> dict[int, _Row]:
@@ -133,7 +133,7 @@ def _geometry(folder: Path, number: int, row: _Row, text: str, size: Size) -> Ge
     if intrinsics:
         video, sizes = folder / "rgb.mp4", [size]
         if video.is_file() and (folder / "rgb").is_dir():  # extracted photos may have been made smaller
-            height, width, _ = VideoFrame(video, 0).read().shape
+            height, width, _ = VideoFrame(video, "000000", 0).read().shape
             sizes.append((height, width))
         camera = fitting_camera(place, (*sizes, USUAL_SIZE), intrinsics)
     return Geometry(camera, pose, tuple(notes), up="y")
@@ -143,7 +143,6 @@ def _geometry(folder: Path, number: int, row: _Row, text: str, size: Size) -> Ge
 class VideoFrame(Source):
     """The frame of a video with a number from 0, decoded as it is asked for."""
 
-    file: Path
     index: int
 
     def read(self) -> np.ndarray:
