@@ -77,15 +77,11 @@ def write_ply(
 
 
 class Written(NamedTuple):
-    """How much of a surface was written.
+    """How much of a surface was written."""
 
-    ``before`` and ``after``: triangles of the mesh, or points of the cloud, at full density and as written; ``how``:
-    what made them fewer, empty if nothing did; see :data:`FLAT`.
-    """
-
-    before: int
-    after: int
-    how: str = ""
+    before: int  # triangles of the mesh, or points of the cloud, at full density
+    after: int  # as written
+    how: str = ""  # what made them fewer, empty if nothing did; see FLAT
 
     def __str__(self) -> str:
         return f"{self.after} of {self.before}, by {self.how}"

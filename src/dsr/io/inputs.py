@@ -51,10 +51,7 @@ _DOUBTED = 8  # about how many maps of a folder are asked whether what makes the
 
 
 class FolderUnits:
-    """The unit and range type of each kind of map from the first by name that has a known pixel.
-
-    The guess depends on all pairs of the folder alone, not on their order, nor on which were read or finished before.
-    """
+    """The unit and range type of each kind of map from the first by name that has a known pixel, whatever was read."""
 
     def __init__(self, pairs: Sequence[Pair] = ()) -> None:
         self._pairs = sorted(pairs, key=lambda pair: (natural_key(pair.depth.name), natural_key(pair.name)))

@@ -90,10 +90,7 @@ def _wrap(text: str, length: float) -> str:
 
 
 class _Page(Canvas):
-    """A page of panels.
-
-    A picture's label is ``ROW: panel`` or ``ROW: detail``, as is that of the frame of an empty panel.
-    """
+    """A page of panels; a picture's label, and that of the frame of an empty panel, is ``ROW: panel``."""
 
     def text(self, x: float, y: float, text: str, **style: Any) -> None:
         """Write a text."""

@@ -224,10 +224,7 @@ class Upsampler:
     def _stream(
         self, frames: Iterable[tuple[Any, ...]], neighbours: int, unit: str | float | None
     ) -> Iterator[Surface[Any]]:
-        """Yield surfaces; as many frames are kept as may vote on one.
-
-        A frame may be read ahead, for those before it; what is wrong with it is an error when its own turn comes.
-        """
+        """Yield surfaces; frames are read ahead for those before them, and their errors wait for their own turn."""
         source, place = enumerate(frames), 0
         kept: dict[int, tuple[Picture, torch.device | None] | ValueError] = {}
         views: dict[int, View] = {}  # of the frames that may vote
@@ -272,12 +269,9 @@ class Upsampler:
         *,
         look: bool = True,
     ) -> Surface[Any]:
-        """Return the surface of a picture on whose depth others vote; ``look`` whether photo and depth fit each other.
-
-        One without any measurement has holes, of which nothing is known.
-        """
+        """Return the surface of a picture on whose depth others vote; ``look`` whether photo and depth fit."""
         size, size_lr = size_of(picture.rgb), size_of(picture.depth_lr)
-        if _is_empty(picture):
+        if _is_empty(picture):  # then nothing is known of its holes
             holes = torch.full((1, *size), torch.nan)
             found = base.Surface(holes, holes, holes, filled=torch.zeros_like(holes, dtype=torch.bool))
             return Surface(picture, found, self._run.plan(size, size_lr), 0.0, device)

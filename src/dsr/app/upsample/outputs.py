@@ -56,17 +56,13 @@ class Result:
 
     @functools.cached_property
     def encoding(self) -> Encoding:
-        """How the result is stored: as the input in the input's format, else in metres, or in whole millimetres.
-
-        It is :data:`dsr.io.depth_files.IN_METRES` itself where the input's values are such and no format is chosen. Of
-        whole numbers of 64 bits, which a TIFF may have and no writer writes, it has 32.
-        """
+        """How the result is stored: as the input in the input's format, else in metres, or in whole millimetres."""
         encoding, chosen = self.picture.encoding, self.wanted.format
         of_metres = replace(encoding, suffix=IN_METRES.suffix, hole=0.0) == replace(IN_METRES, hole=0.0)
         if chosen is None and of_metres and math.isnan(encoding.hole):
             return IN_METRES
         own = "tiff" if encoding.suffix == ".tif" else encoding.suffix[1:]
-        if chosen in (None, own):
+        if chosen in (None, own):  # whole numbers of 64 bits, which a TIFF may have and no writer writes, become 32
             return replace(encoding, dtype=str(storable(encoding.suffix, np.dtype(encoding.dtype))))
         if chosen in ("png", "mm"):
             return Encoding(".png", "uint16", 1e-3, 0.0, "orthogonal")
@@ -87,12 +83,7 @@ class Output(NamedTuple):
 
 
 class ResultFolder:
-    """The folder of a result, what the result depends on, as values for JSON, and the earlier run in it.
-
-    Attributes:
-        earlier: the ``info.json`` of the earlier run; empty without one.
-
-    """
+    """The folder of a result, what the result depends on, and ``earlier``: the ``info.json`` of the run before."""
 
     def __init__(self, path: Path, inputs: Values, settings: Values, wanted: Results, *, strict: bool = False) -> None:
         self.path, self.inputs, self.settings = path, inputs, settings
@@ -146,10 +137,7 @@ class ResultFolder:
 
     @property
     def done(self) -> bool:
-        """Whether all requested parts exist as wanted, if ``strict`` by a run with the checks of today.
-
-        A mesh of large triangles is none of every pixel; the other one serves for both.
-        """
+        """Whether all requested parts exist as wanted, if ``strict`` by a run with the checks of today."""
         if not self.reusable or (self._strict and self.earlier.get("checks") != CHECKS):
             return False
         wanted = self._wanted
@@ -157,7 +145,8 @@ class ResultFolder:
         if METRES not in there and any(part.name == "depth" for part in wanted.of_frame):
             return False
         shapes = [self.earlier.get(part.name) for part in wanted.of_frame if part.shape]
-        if wanted.keep == "all" and any(isinstance(shape, dict) and shape.get("how") == FLAT for shape in shapes):
+        large = any(isinstance(shape, dict) and shape.get("how") == FLAT for shape in shapes)
+        if wanted.keep == "all" and large:  # which wants every pixel; a mesh of these serves for both
             return False
         return all(there & set(part.files) for part in wanted.of_frame)
 

@@ -143,10 +143,7 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
 
 
 def work_through(request: UpsampleRequest, frames: Frames, tell: Tell, progress: Progress) -> Iterator[Done]:
-    """Upsample frames in ``--workers`` processes, each with its share of the cores; yield each once it is done.
-
-    Notes are shown in the order of the frames, or as they come from several workers.
-    """
+    """Upsample frames in ``--workers`` processes, each with its share of the cores; yield each once it is done."""
     output = request.results.output  # the folder of a single frame; no link leads those of several out of it
     jobs = [(pair, output if frames.single else path_within(output, pair.name, output)) for pair in frames.found.pairs]
     workers = min(request.frames.workers, len(jobs))
@@ -233,10 +230,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 class FrameWork:
-    """Upsamples the frames of a request, one at a time; those of other shards are neighbours and determine units.
-
-    Of the photos that were read last so many numbers are ``kept`` for their own turn, or as neighbours.
-    """
+    """Upsamples the frames of a request, one at a time; those of other shards are neighbours and determine units."""
 
     def __init__(self, request: UpsampleRequest, frames: Frames, kept: int = _KEPT) -> None:
         self._request, self._frames, self._kept = request, frames, kept
@@ -357,10 +351,7 @@ def _describe(surface: Surface, how: Upsampling) -> list[Assumption]:
 
 
 def _in_brief(noise: MapNoise | None, shares: Mapping[str, float]) -> list[str]:
-    """Return the noise of the input, the size that it was worked on at, and the shares of the pixels that are not 0.
-
-    A share is 0 % or 100 % only if it is exactly that.
-    """
+    """Return the noise of the input, the size that it was worked on at, and the shares of the pixels that are not 0."""
     brief = []
     if noise is not None:
         brief.append(f"noise {show_length(noise.deviation, 2)}")
@@ -368,7 +359,7 @@ def _in_brief(noise: MapNoise | None, shares: Mapping[str, float]) -> list[str]:
             brief.append(f"worked on at 1/{noise.reduced}")
     words = {"open": "left open", "glass": "like glass"}
     for name, share in shares.items():
-        if share:
+        if share:  # 0 % and 100 % are exactly that
             percent = f"{min(max(round(100 * share, 1), 0.1), 99.9):g}%" if share < 1 else f"{share:.0%}"
             brief.append(f"{words.get(name, name)} {percent}")
     return brief

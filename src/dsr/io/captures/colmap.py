@@ -200,10 +200,7 @@ def find_colmap(folder: Path) -> PairingResult | None:
 
 @dataclass(frozen=True, eq=False)
 class _SparseDepth(Source):
-    """The depth of the points that an image shows, from the file of the points.
-
-    The map has about a pixel for each of them; of several points in a pixel it has the nearest.
-    """
+    """The depth of the points that an image shows, about a pixel for each; of several in a pixel the nearest."""
 
     image: _Image
     camera: _Camera
