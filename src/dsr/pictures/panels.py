@@ -23,24 +23,17 @@ from dsr.sample import DepthSample
 from dsr.utils.ratios import round_ratio
 
 _DPI = 160
-_LONGEST = 1472
-"""Maximum longer side of a drawn map of errors, pixels: twice a panel."""
-_DEGREES = (1.0, 60.0)
-"""Limits of the colours of normals' errors."""
+_LONGEST = 1472  # maximum longer side of a drawn map of errors, pixels: twice a panel
+_DEGREES = (1.0, 60.0)  # limits of the colours of normals' errors
 _FEWEST_DPI, _MOST_DPI = 120, 200
 """Least and most pixels per inch; between them, a panel has 3 pixels for 4 of the picture."""
-_PANEL, _TALLEST, _NARROWEST = 3.78, 4.6, 2.2
-"""Maximum panel width, maximum panel height and minimum column width, inches."""
+_PANEL, _TALLEST, _NARROWEST = 3.78, 4.6, 2.2  # largest width and height of a panel, least of a column, inches
 _LEFT, _GAP, _HEADING, _BETWEEN, _BELOW = 0.3, 0.1, 0.92, 0.1, 0.62
 """Space left of the panels, between columns, above the first row, between rows and below the last row, inches."""
-_SIDE = 1536
-"""Maximum longer side of a drawn picture, pixels: twice the side of a panel."""
-_DETAIL = 4
-"""The detail is 1/4 of the picture wide and high."""
+_SIDE = 1536  # maximum longer side of a drawn picture, pixels: twice the side of a panel
+_DETAIL = 4  # the detail is 1/4 of the picture wide and high
 _FRAME = "#ff8c00"
 _ROWS = ("lit from above", "detail", "normals | depth")
-
-
 _WHOLE = Part(0, 1, 0, 1)
 
 

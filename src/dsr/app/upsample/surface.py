@@ -32,8 +32,8 @@ from dsr.notes import warn
 from dsr.pictures.canvas import encode_row
 
 Array = TypeVar("Array", np.ndarray, Tensor)
+# of `dsr upsample`, which Surface.save takes
 _OPTIONS = ("format", "max_error", "certain", "max_faces", "max_points", "keep", "overwrite")
-"""What :meth:`Surface.save` takes of the options of ``dsr upsample``."""
 
 
 class Points(NamedTuple):
