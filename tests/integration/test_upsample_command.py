@@ -321,7 +321,7 @@ def test_sensor_is_recognised_by_the_depth_values_and_must_not_contradict_them(t
     [
         (("--method", "magic"), "--method: expected one of"),
         (("--format", "jpg"), "--format: expected one of"),
-        (("--only", "depth,film"), "--only, --with, --without: expected some of"),
+        (("--only", "depth,film"), "--only: expected some of depth, "),
         (("--only", ","), "expected something to be left to write"),
         (("--depth-unit", "inch"), "--depth-unit: expected"),
         (("--fov", "200"), "--fov: expected degrees"),

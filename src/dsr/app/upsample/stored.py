@@ -186,11 +186,10 @@ def read_errors(folder: Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     path = folder / ERRORS
     size = (camera.height, camera.width)
     shapes = {name: shape for name, (shape, _) in array_headers(path).items()}
-    if any(shapes.get(name) != size for name in ("depth_error", "angle_error")):
-        raise ValueError(f"{path}: expected depth_error and angle_error of shape {size}, the photo's, got {shapes}")
-    errors = load_errors(path)
+    fits = all(shapes.get(name) == size for name in ("depth_error", "angle_error"))
+    errors = load_errors(path) if fits else None
     if errors is None:
-        raise ValueError(f"{path}: expected depth_error and angle_error, got {shapes}")
+        raise ValueError(f"{path}: expected depth_error and angle_error of shape {size}, the photo's, got {shapes}")
     return errors[0][0].numpy(), errors[1][0].numpy()
 
 
