@@ -321,6 +321,7 @@ def test_sensor_is_recognised_by_the_depth_values_and_must_not_contradict_them(t
     [
         (("--method", "magic"), "--method: expected one of"),
         (("--format", "jpg"), "--format: expected one of"),
+        (("--only", "depth,film"), "--only: expected some of depth, "),
         (("--only", ","), "expected something to be left to write"),
         (("--range-type", "disparity"), "depth.png: disparities need the distance between the two cameras"),
         (("--method", "facets", "--noise", "-1"), "--noise: expected metres"),
@@ -334,16 +335,14 @@ def test_invalid_arguments_are_refused_in_one_line(pair, tmp_path, capsys, argum
     assert not (tmp_path / "out").exists()
 
 
-def test_photos_and_depth_maps_in_two_arguments_are_refused_with_the_options_for_them(
-    pair, tmp_path, capsys, monkeypatch
-):
-    for number, name in enumerate(("color/0.png", "depth/0.png", "other/0.png")):
-        (tmp_path / name).parent.mkdir()
-        shutil.copy(pair[number % 2], tmp_path / name)
-    monkeypatch.chdir(tmp_path)
-    message = refused_line(capsys, upsample("color", "depth", "-o", "out", "--dry-run"))
-    assert message.endswith("--rgb color --depth depth")
-    assert "--rgb" not in refused_line(capsys, upsample("color", "other/0.png", "-o", "out", "--dry-run"))
+def test_photos_and_depth_maps_in_two_arguments_are_refused_with_the_options_for_them(pair, tmp_path, capsys):
+    for file, name in zip(pair, ("color", "depth"), strict=False):
+        (tmp_path / name).mkdir()
+        shutil.copy(file, tmp_path / name)
+    places = tmp_path / "color", tmp_path / "depth"
+    message = refused_line(capsys, upsample(*places, "-o", tmp_path / "out", "--dry-run"))
+    assert message.startswith(f"{places[0]}: expected photos and depth maps")
+    assert message.endswith("--rgb PHOTOS --depth MAPS")
 
 
 def test_pictures_that_do_not_fit_each_other_are_refused_in_one_line(pair, tmp_path, capsys):

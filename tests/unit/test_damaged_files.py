@@ -24,6 +24,7 @@ from single_files import READERS, read_capture, read_picture_file
 from small_results import write_result
 
 from dsr.app.upsample.outputs import ResultFolder
+from dsr.app.upsample.parts import Results
 from dsr.app.upsample.stored import read_exports, read_info, read_result
 from dsr.data import matlab
 from dsr.data.download.fetching import Checksums, unpack
@@ -378,7 +379,7 @@ def test_damaged_depth_of_an_earlier_result_is_made_again_and_refused_where_it_i
     folder = write_result(tmp_path / "a")
     path = folder / "depth_metres.tiff"
     path.write_bytes(damage(path.read_bytes()))
-    stored = ResultFolder(folder, {}, {}, overwrite=False)
+    stored = ResultFolder(folder, {}, {}, Results(output=folder))
     assert stored.surface(Camera(64, 64, 80.0, 80.0, 31.0, 32.5), errors=False) is None
     assert ": expected" in refusal(path, read_result, folder, "a")
 
