@@ -3,7 +3,7 @@
 # make test-all  these and the nightly ones: campaigns, real Slurm, published peers, further ways to interrupt
 # make unit  the unit tests alone, about a minute
 # make fuzz  10,000 damaged, foreign and malicious files for every reader (ARGS="--rounds 3 --seed 1 -k polycam")
-# make chaos commands that are killed and run at once (ARGS="--kills 100 --seed 0")
+# make chaos commands that are killed and run at once (ARGS="--kills 3 -k upsample")
 # make mistakes  inputs that can be computed with and are wrong: which are told (ARGS="--cases 500 --seed 0")
 # make benchmark  speed ratios: dsr against plain implementations (ARGS="--json before.json")
 # make dist  what a release consists of, built and checked, in dist
@@ -48,7 +48,7 @@ dist: $(VENV)/installed-dev
 	$(BIN)/python scripts/dist.py $(ARGS)
 
 chaos: $(VENV)/installed-dev
-	PYTHONPATH=tests $(BIN)/python -m chaos $(ARGS)
+	$(BIN)/python -m pytest --kills 9 tests/chaos $(ARGS)
 
 mistakes: $(VENV)/installed-dev
 	OMP_NUM_THREADS=1 PYTHONPATH=tests:benchmarks $(BIN)/python -m mistakes $(ARGS)

@@ -9,6 +9,7 @@ import zlib
 import cv2
 import numpy as np
 import OpenEXR
+import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -397,8 +398,7 @@ def iphone_map(number):
 
 def scannetpp(folder, kind="lz4"):
     """Write the iPhone of a scene of ScanNet++, photos of 192 x 256, its maps as LZ4 or deflate, or extracted."""
-    import lz4.block  # noqa: PLC0415 - an extra
-
+    block = pytest.importorskip("lz4.block")
     entries, parts, place = {}, [], folder / "iphone"
     for number in range(FRAMES):
         matrix = np.diag([4, 4, 1]) @ intrinsic_matrix()
@@ -407,7 +407,7 @@ def scannetpp(folder, kind="lz4"):
         aligned = {"aligned_pose": pose(number).tolist(), "pose": (pose(number) @ FLIP).tolist()}
         entries[f"frame_{number:06}"] = {"timestamp": 0.1, "intrinsic": matrix.tolist(), "imu": [], **aligned}
         values = np.round(1000 * iphone_map(number)).astype("<u2")
-        packed = lz4.block.compress(values.tobytes(), store_size=False)
+        packed = block.compress(values.tobytes(), store_size=False)
         if kind == "deflate":
             packing = zlib.compressobj(wbits=-15)
             packed = packing.compress(iphone_map(number).astype("<f4").tobytes()) + packing.flush()

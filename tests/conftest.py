@@ -16,7 +16,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from browser_pages import Window
 from hydra.core.hydra_config import HydraConfig
 
 from dsr.degradation.downsampling import Downsampling, make_sample
@@ -168,6 +167,38 @@ def webgl_browser() -> Iterator[Any]:
         started = driver.chromium.launch(executable_path=path, args=list(CHROMIUM_ARGUMENTS))
         yield started
         started.close()
+
+
+class Window:
+    """A page; ``wrong`` has its errors, and its requests of anything but local pages, ``dialogs`` what it asks."""
+
+    def __init__(self, browser: Any, **options: Any) -> None:
+        self.context = browser.new_context(**({"viewport": {"width": 1280, "height": 900}} | options))
+        self.page = self.context.new_page()
+        self.wrong: list[str] = []
+        self.dialogs: list[str] = []
+        self.page.on("console", lambda message: self.wrong.append(message.text))
+        self.page.on("pageerror", lambda error: self.wrong.append(str(error)))
+        self.page.on("dialog", lambda dialog: (self.dialogs.append(dialog.message), dialog.dismiss()))
+        self.page.on("request", lambda request: None if _harmless(request.url) else self.wrong.append(request.url))
+
+    def settle(self) -> None:
+        """Wait until what was asked for is drawn."""
+        self.page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+    def press(self, *keys: str) -> None:
+        """Press keys one after the other."""
+        for key in keys:
+            self.page.keyboard.press(key)
+
+    def close(self) -> None:
+        """Close the page, which must have done nothing wrong."""
+        self.context.close()
+        assert self.wrong == self.dialogs == []
+
+
+def _harmless(url: str) -> bool:
+    return url.startswith(("data:", "blob:", "about:")) or (url.startswith("file:") and ".html" in url)
 
 
 @pytest.fixture

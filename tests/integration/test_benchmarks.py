@@ -27,19 +27,6 @@ def test_benchmark_prints_ratios(name: str, tmp_path: Path) -> None:
     assert [line.split()[-1] for line in compared] == ["1.000"] * ratios
 
 
-def test_case_without_its_data_is_skipped(tmp_path: Path) -> None:
-    printed = run_benchmark("run.py", "published", "evaluation", "--shared", str(tmp_path)).splitlines()
-    assert [line.split(": ")[:2] for line in printed] == [["published", "skipped"], ["evaluation", "skipped"]]
-
-
-def test_method_cost_benchmark_measures(shared: Path) -> None:
-    arguments = ("--shared", str(shared), "--set", "methods=nearest", "scales=4")
-    printed = run_benchmark("run.py", "methods", *arguments).splitlines()
-    assert [line.split()[:4] for line in printed] == [
-        ["methods", "nearest", "x4,", key] for key in ("s", "MB", "parameters")
-    ]
-
-
 def run_benchmark(name: str, *arguments: str) -> str:
     """Run a benchmark and return what it printed."""
     done = run_python(str(BENCHMARKS / name), *arguments, cwd=BENCHMARKS.parent)

@@ -3,16 +3,11 @@
 import csv
 import json
 import re
-import signal
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import Program
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 QUICK = (
     "dataset.size=48", "metrics.lpips=false", "method.steps=40", "method.widths=[8,16]", "method.skips=[2,2]",
     "method.validate_every=20",
@@ -64,23 +59,6 @@ def test_scores_and_logs_of_each_validation_and_a_result_of_the_scene_alone(tmp_
     assert run("method=dip_v", other, "output_dir=turned", "method.validate_every=0")[0] == 0
     for scene in SCENES:
         assert np.array_equal(depth(home, scene), depth(tmp_path / "turned", scene))
-
-
-@pytest.mark.nightly
-def test_interrupted_run_begins_the_image_again(tmp_path, run):
-    arguments = ("method=dip_v", "dataset.scenes=[statue]", "method.steps=60", "method.validate_every=10")
-    tables = [tmp_path / name / "optimisation" / "statue" / "validation.csv" for name in ("out", "whole")]
-    with Program(str(REPOSITORY / "eval.py"), *QUICK, *arguments, "output_dir=out", cwd=tmp_path) as process:
-        deadline = time.monotonic() + 60
-        while not tables[0].is_file() and time.monotonic() < deadline:
-            time.sleep(0.02)
-        process.send_signal(signal.SIGTERM)
-        _, errors = process.communicate(timeout=60)
-    assert (process.returncode, errors.count("\n")) == (143, 1)
-    for name in ("out", "whole"):
-        assert run(*arguments, f"output_dir={name}")[0] == 0
-    assert np.array_equal(depth(tmp_path / "out", "statue"), depth(tmp_path / "whole", "statue"))
-    assert tables[0].read_text() == tables[1].read_text()
 
 
 def test_oracle_is_named_in_scores_and_table(tmp_path, run):

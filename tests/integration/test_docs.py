@@ -16,7 +16,12 @@ from dsr.app.schema import EvalConfig, TrainConfig, plain_config, register
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
-PAGES = (ROOT / "README.md", ROOT / "src/dsr/methods/weights/README.md", *sorted(DOCS.rglob("*.md")))
+PAGES = (
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "src/dsr/methods/weights/README.md",
+    *sorted(DOCS.rglob("*.md")),
+)
 EXTENDING = DOCS / "extend.md"  # Its commands use the modules that it contains; test_extensions runs them
 
 

@@ -4,14 +4,12 @@ import csv
 import json
 import os
 import re
-import signal
-import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from commands import Program, run_python
+from commands import run_python
 
 from dsr.evaluation.run_files import load_results
 from dsr.report.tables import build_tables
@@ -289,22 +287,6 @@ def test_measured_map_of_any_size_is_upsampled_at_its_own_ratio_and_no_other(tmp
     code, output, errors = within(*arguments, f"scale={ratio}")
     assert (code, errors) == (0, [])
     assert "predictions re-used: 1" in output
-
-
-@pytest.mark.nightly
-def test_interrupted_run_keeps_finished_scenes_and_resumes(tmp_path, offline):
-    given = (str(REPOSITORY / "eval.py"), "dataset.size=256", "method=bicubic", "output_dir=out", "metrics.lpips=false")
-    with Program(*given, cwd=tmp_path, env=offline) as process:
-        deadline = time.monotonic() + 60
-        while not list((tmp_path / "out" / "predictions").glob("[!.]*.npz")) and time.monotonic() < deadline:
-            time.sleep(0.02)
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=60)
-    assert (process.returncode, errors.count("\n")) == (130, 1)
-    finished = [path.name for path in (tmp_path / "out" / "predictions").iterdir()]
-    assert 0 < len(finished) < 6
-    assert not any(name.startswith(".") for name in finished)
-    assert f"predictions re-used: {len(finished)}" in run_python(*given, cwd=tmp_path, env=offline).stdout
 
 
 def test_several_workers_give_the_files_of_one(tmp_path, offline, within):

@@ -1,39 +1,21 @@
 """What a Hydra user expects: every node of the configuration is one for ``hydra.utils.instantiate``."""
 
-from functools import partial
-from pathlib import Path
-from typing import Any
-
-import lightning
 import pytest
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from lightning.pytorch.callbacks import Callback, EarlyStopping
-from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
-from methods_at_hand import AT_HAND
 
 import dsr
 from dsr.app.schema import TrainConfig, plain_config
 from dsr.degradation.downsampling import Downsampling, Measured
-from dsr.methods.base import Method
 from dsr.methods.networks.network import DisparityNetwork
-from dsr.methods.recipe import read_recipe
 from dsr.training.module import SuperResolution
 from dsr.training.objective import Objective
-from dsr.training.settings import PatchSettings
 from dsr.utils.configuration import build, config_directories, list_choices
 
 
 def choices(group: str) -> list[str]:
     return list_choices(group, config_directories())
-
-
-@pytest.mark.parametrize("name", [name for name in AT_HAND if read_recipe(name).abilities.needs is None])
-def test_method_without_weights_is_instantiated(name: str) -> None:
-    made = instantiate(dsr.compose("eval", [f"method={name}"]).method)
-    assert isinstance(made, Method)
-    assert type(made) is read_recipe(name).kind
 
 
 @pytest.mark.parametrize(
@@ -45,11 +27,6 @@ def test_group_is_instantiated_as_the_command_builds_it(group: str, name: str) -
     assert type(made) is type(built)
     assert made == built or vars(made) == vars(built)
     assert group != "downsampling" or isinstance(made, Downsampling | Measured)
-
-
-def test_data_set_is_instantiated_and_loads() -> None:
-    source = instantiate(dsr.compose("eval", ["dataset=simgeo", "dataset.size=32"]).dataset)
-    assert source.load(source.scenes()[0]).depth.shape == (1, 32, 32)
 
 
 @pytest.mark.parametrize("name", choices("model"))
@@ -65,29 +42,6 @@ def test_model_is_the_lightning_module_with_its_optimiser_and_schedule(name: str
     assert made["optimizer"].defaults["lr"] == 0.02
     schedule = made["lr_scheduler"]["scheduler"]
     assert [schedule.lr_lambdas[0](step) for step in (0, 10)] == [pytest.approx(1 / 300), pytest.approx(11 / 300)]
-
-
-@pytest.mark.parametrize("name", choices("trainer"))
-def test_trainer_and_patches_are_instantiated(name: str) -> None:
-    config = dsr.compose("train", [f"trainer={name}", "+trainer.enable_progress_bar=false"])
-    trainer = instantiate(config.trainer, logger=False)
-    assert isinstance(trainer, lightning.Trainer)
-    assert trainer.max_steps == config.trainer.max_steps
-    assert isinstance(instantiate(config.patches), PatchSettings)
-
-
-def test_optimisers_schedules_callbacks_and_loggers_are_nodes(tmp_path: Path) -> None:
-    more = ["optimizer=sgd", "scheduler=constant", "callbacks=[default,early_stopping,learning_rate]"]
-    config = dsr.compose("train", [*more, "logger=[tensorboard,csv]"])
-    assert isinstance(instantiate(config.model.optimizer), partial)
-    made = instantiate(config.model).configure_optimizers()
-    assert type(made["optimizer"]) is torch.optim.SGD
-    callbacks = [instantiate(node) for node in config.callbacks.values()]
-    assert all(isinstance(each, Callback) for each in callbacks)
-    assert any(isinstance(each, EarlyStopping) for each in callbacks)
-    loggers: list[Any] = [instantiate(node, save_dir=str(tmp_path)) for node in config.logger.values()]
-    assert type(loggers[0]) is TensorBoardLogger
-    assert isinstance(loggers[1], CSVLogger)
 
 
 def test_composed_configuration_names_its_choices(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -68,6 +68,15 @@ def test_jobs_are_run_and_complete_scenes_are_reused(multirun, tmp_path, launche
     assert "predictions re-used: 1 (overwrite=true computes them again)" in multirun("eval", *arguments)[1]
 
 
+def test_experiment_leaves_out_the_data_sets_that_are_not_there(multirun, tmp_path):
+    given = ("+experiment=paper_tables", "method=bicubic", "dataset.scenes=[statue]", *SMALL)
+    code, _, [note] = multirun("eval", *given)
+    assert (code, note[:28], "icl" in note) == (0, "note: left out, as not in da", True)
+    assert sorted(path.name for path in (tmp_path / "outputs" / "eval").iterdir()) == [
+        f"bicubic_x{scale}_simgeo_scenes-statue_size64_seed0" for scale in (4, 8)
+    ]
+
+
 SWEEP = """
 import os, sys, time
 from pathlib import Path

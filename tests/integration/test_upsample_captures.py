@@ -33,18 +33,6 @@ def test_capture_of_a_phone_has_nothing_left_to_assume(tmp_path, capsys):
     assert f"{FRAMES} complete already" in capsys.readouterr().out
 
 
-def test_least_confidence_makes_holes_and_is_kept_with_the_settings(tmp_path, capsys):
-    folder, out = captures.polycam(tmp_path / "scan"), tmp_path / "out"
-    assert upsample(folder, "-o", out, *DEPTH_ONLY, "--fill", "none", "--min-confidence", 0.5) == 0
-    assert "confidence below 0.5 counts as a hole (12.5%)" in capsys.readouterr().out
-    stored = np.asarray(Image.open(out / "1000" / "depth.png"))
-    assert (stored[:, :8] == 0).all()
-    assert (stored[:, 8:] > 0).all()
-    reported = info(out / "1000")
-    assert reported["settings"]["min_confidence"] == 0.5
-    assert set(reported["inputs"]) == {"rgb", "depth", "confidence", "capture"}
-
-
 @pytest.fixture
 def lists(tmp_path):
     """Two pairs in folders, with confidence maps in a folder of their own."""
@@ -56,7 +44,7 @@ def lists(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["bytes", "fractions"])
-def test_confidence_maps_may_be_bytes_or_fractions(lists, kind):
+def test_confidence_maps_may_be_bytes_or_fractions_and_the_least_is_kept_with_the_settings(lists, capsys, kind):
     for number in range(2):
         path = lists / "sure" / f"confidence_{number:03}.png"
         if kind == "bytes":
@@ -67,9 +55,11 @@ def test_confidence_maps_may_be_bytes_or_fractions(lists, kind):
     given = ("--rgb", lists / "rgb", "--depth", lists / "depth", "--confidence", lists / "sure")
     out = lists / "out"
     assert upsample(*given, "--min-confidence", 0.5, "--fill", "none", "-o", out, *DEPTH_ONLY) == 0
+    assert "confidence below 0.5 counts as a hole (12.5%)" in capsys.readouterr().out
     for number in range(2):
         holes = np.asarray(Image.open(out / str(number) / "depth.png")) == 0
         np.testing.assert_array_equal(np.flatnonzero(holes.any(axis=0)), np.arange(8))
+        assert info(out / str(number))["settings"]["min_confidence"] == 0.5
 
 
 def test_confidence_that_does_not_fit_is_refused_in_one_line(lists, capsys):

@@ -55,10 +55,10 @@ def test_pictures_of_workers_that_are_killed_twice_fail_and_the_same_command_goe
     node = f"_target_: killing.Killer\nmarks: {tmp_path / 'marks'}\ntimes: 2\n"
     (tmp_path / "conf" / "method" / "killer.yaml").write_text(node)
     folder, out = write_frames(tmp_path / "frames", 2, holes=0), tmp_path / "out"
-    command = (folder, "-o", out, "--config-dir", tmp_path / "conf", "--method", "killer", *FAST[2:], "--workers", "2")
-    assert upsample(*command) == 2
+    command = (folder, "-o", out, "--config-dir", tmp_path / "conf", "--method", "killer", *FAST[2:], "--workers")
+    assert upsample(*command, "2") == 2
     assert " killed " in capsys.readouterr().err
-    assert upsample(*command) == 0
+    assert upsample(*command, "1") == 0
     assert sorted(path.name for path in out.iterdir()) == ["000", "001"]
 
 

@@ -318,50 +318,57 @@ def test_archive_whose_members_are_too_large_or_of_another_app_is_refused(folder
     assert read_picture(find_pairs_of_folder(folder).pairs[2], Reading()).depth_lr.isfinite().all()
 
 
-def change_text(name, old, new):
-    def change(folder):
-        text = (folder / name).read_text()
-        assert old in text
-        (folder / name).write_text(text.replace(old, new, 1))
+def changed(write, name, change):
+    """How a capture is written of which one file has other bytes."""
 
-    return change
+    def write_changed(folder):
+        write(folder)
+        path = folder / name
+        path.write_bytes(change(path.read_bytes()))
+
+    return write_changed
 
 
-def change_camera(**changes):
-    def change(folder):
-        path = folder / "keyframes" / "corrected_cameras" / "1000.json"
-        path.write_text(json.dumps(captures.polycam_camera(0, **changes)))
+def swap(old, new):
+    return lambda content: content.replace(old, new, 1)
 
-    return change
+
+def put(place, form, value):
+    return lambda content: content[:place] + struct.pack(form, value) + content[place + struct.calcsize(form) :]
+
+
+def with_camera(**changes):
+    camera = json.dumps(captures.polycam_camera(0, **changes)).encode()
+    return changed(captures.polycam, "keyframes/corrected_cameras/1000.json", lambda _: camera)
 
 
 MIRROR = {f"t_{row}{row}": 1.0 - 2 * (row == 0) for row in range(3)} | {
     f"t_{row}{column}": 0.0 for row in range(3) for column in range(3) if row != column
 }
 NO_POSE = "expected a rigid transform"
-PINCAM = "lowres_wide_intrinsics/41069021_10.001.pincam"
 BROKEN = {
-    "intrinsics of a frame": (captures.stray, change_text("odometry.csv", ", 51.000000000", ", nan"),
+    "intrinsics of a frame": (changed(captures.stray, "odometry.csv", swap(b", 51.000000000", b", nan")),
                               "odometry.csv: frame 0: camera fy: expected"),
-    "a matrix that is sheared": (captures.polycam, change_camera(t_01=2.0), f"1000.json: {NO_POSE}"),
-    "a mirrored matrix": (captures.polycam, change_camera(**MIRROR), f"1000.json: {NO_POSE}"),
-    "a camera without a key": (captures.polycam, change_camera(fx=None), "1000.json: expected Polycam's camera; fx:"),
-    "intrinsics in a file": (captures.arkitscenes, lambda folder: (folder / PINCAM).write_text("64 48 nan 51 31 24"),
+    "a matrix that is sheared": (with_camera(t_01=2.0), f"1000.json: {NO_POSE}"),
+    "a mirrored matrix": (with_camera(**MIRROR), f"1000.json: {NO_POSE}"),
+    "a camera without a key": (with_camera(fx=None), "1000.json: expected Polycam's camera; fx:"),
+    "intrinsics in a file": (changed(captures.arkitscenes, "lowres_wide_intrinsics/41069021_10.001.pincam",
+                                     lambda _: b"64 48 nan 51 31 24"),
                              "10.001.pincam: camera fx: expected a finite number"),
     "Record3D": (lambda folder: captures.record3d(folder / "a.r3d", perFrameIntrinsicCoeffs=[[np.nan, 1, 1, 1]]),
-                 lambda _: None, "metadata: frame 0: camera fx: expected a finite number"),
-    "7-Scenes": (captures.seven_scenes, lambda folder: captures.write_matrix(
-        folder / "frame-000000.pose.txt", 2 * np.eye(4)), "frame-000000.pose.txt: expected "),
-    "3D Scanner App": (captures.scanner_app, lambda folder: (folder / "frame_00000.json").write_text(
-        '{"intrinsics": [1], "cameraPoseARFrame": []}'), "frame_00000.json: expected 3D Scanner App's frame; intr"),
+                 "metadata: frame 0: camera fx: expected a finite number"),
+    "7-Scenes": (changed(captures.seven_scenes, "frame-000000.pose.txt", lambda _: b"2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 2"),
+                 "frame-000000.pose.txt: expected "),
+    "3D Scanner App": (changed(captures.scanner_app, "frame_00000.json",
+                               lambda _: b'{"intrinsics": [1], "cameraPoseARFrame": []}'),
+                       "frame_00000.json: expected 3D Scanner App's frame; intr"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("what", BROKEN)
 def test_broken_frame_is_refused_in_one_line_and_the_others_are_read(folder, what):
-    write, change, message = BROKEN[what]
+    write, message = BROKEN[what]
     write(folder)
-    change(folder)
     pairs = find_pairs_of_folder(folder).pairs
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
         read_picture(pairs[0], Reading())
@@ -395,7 +402,6 @@ def test_photos_of_scannet_that_were_made_as_small_as_the_maps_have_the_camera_o
 
 @pytest.mark.parametrize("kind", ["lz4", "deflate", "files"])
 def test_iphone_of_scannetpp_has_its_maps_video_and_aligned_poses(folder, kind):
-    pytest.importorskip("lz4")
     captures.scannetpp(folder, kind)
     pictures = read_all(folder)
     assert len(pictures) == FRAMES
@@ -419,14 +425,6 @@ def test_scene_of_sun_rgbd_has_its_bits_turned_back_and_the_sensors_own_map(fold
     captures.save(folder / "depth" / "0000144.png", captures.millimetres())
     [given] = read_all(folder, unit=1e-3)
     np.testing.assert_allclose(given.depth_lr[0], captures.depth(), atol=6e-4)
-
-
-def test_real_scenes_of_sun_rgbd_are_read_in_metres(shared):
-    for name in ("img_0063", "2014-12-18_11-31-54_260595134347"):
-        [picture] = read_all(shared / "real" / "sunrgbd" / name)
-        known = picture.depth_lr[~picture.depth_lr.isnan()]
-        assert 1 < float(known.median()) < 4
-        assert float(known.max()) < 12
 
 
 def test_replica_has_its_unit_from_the_file_here_or_one_folder_up_or_from_the_data_set(folder):
@@ -482,68 +480,40 @@ def test_tum_lists_have_the_poses_of_the_ground_truth_that_are_near_in_time(fold
         find_pairs_of_folder(folder)
 
 
-def header(place, form, *values):
-    def change(path):
-        content = bytearray(path.read_bytes())
-        struct.pack_into(form, content, place, *values)
-        path.write_bytes(content)
-
-    return change
+def other_sens(change):
+    return changed(SENS.write, "a.sens", change)
 
 
-def sens_with(change):
-    def write(folder):
-        change(captures.sens(folder / "a.sens"))
-
-    return write
+def other_iphone(change):
+    return changed(captures.scannetpp, "iphone/depth.bin", change)
 
 
-def scannetpp_with(change):
-    def write(folder):
-        pytest.importorskip("lz4")
-        captures.scannetpp(folder)
-        path = folder / "iphone" / "depth.bin"
-        path.write_bytes(change(path.read_bytes()))
-
-    return write
+def other_zed(old, new):
+    return changed(captures.zed, "SN12345.conf", swap(old, new))
 
 
-def zed_with(old, new):
-    def write(folder):
-        path = captures.zed(folder) / "SN12345.conf"
-        path.write_text(path.read_text().replace(old, new))
-
-    return write
-
-
-def stray_of_another_app(folder):
-    captures.stray(folder)
-    (folder / "odometry.csv").write_text("time,lat,lon\n1,2,3\n")
-
-
-def two_calibrations(folder):
-    (captures.zed(folder) / "SN2.conf").touch()
-
-
+CALIBRATION = r"SN12345\.conf: "
 REFUSED = {
-    "another version": (sens_with(header(0, "<I", 3)), "a.sens: .* of version 4, got another file"),
-    "truncated header": (sens_with(lambda path: path.write_bytes(path.read_bytes()[:99])), "damaged or foreign file"),
-    "no such compression": (sens_with(header(21 + 256 + 4, "<i", 2)), "got compression 2 and 2"),
-    "no unit": (sens_with(header(21 + 256 + 24, "<f", float("nan"))), "expected sizes and values per metre"),
-    "too many frames": (sens_with(header(21 + 256 + 28, "<Q", 1 << 60)), "frames, got 1152921504606846976"),
-    "a frame without end": (sens_with(header(21 + 292 + 80, "<Q", (1 << 64) - 1)), "ends in frame 0"),
-    "no frames": (sens_with(header(21 + 256 + 28, "<Q", 0)), "expected frames, there is none"),
-    "maps compressed together": (scannetpp_with(lambda content: zlib.compress(content)[2:-4]),
+    "another version": (other_sens(put(0, "<I", 3)), "a.sens: .* of version 4, got another file"),
+    "truncated header": (other_sens(lambda content: content[:99]), "damaged or foreign file"),
+    "no such compression": (other_sens(put(21 + 256 + 4, "<i", 2)), "got compression 2 and 2"),
+    "no unit": (other_sens(put(21 + 256 + 24, "<f", float("nan"))), "expected sizes and values per metre"),
+    "too many frames": (other_sens(put(21 + 256 + 28, "<Q", 1 << 60)), "frames, got 1152921504606846976"),
+    "a frame without end": (other_sens(put(21 + 292 + 80, "<Q", (1 << 64) - 1)), "ends in frame 0"),
+    "no frames": (other_sens(put(21 + 256 + 28, "<Q", 0)), "expected frames, there is none"),
+    "maps compressed together": (other_iphone(lambda content: zlib.compress(content)[2:-4]),
                                  "depth.bin: expected maps one by one, map 0 is damaged, or all are compressed"),
-    "damaged map": (scannetpp_with(lambda content: content[:4] + b"\xff" * 40 + content[44:]),
+    "damaged map": (other_iphone(lambda content: content[:4] + b"\xff" * 40 + content[44:]),
                     "depth.bin/000000: expected compressed data of 196608 bytes, got damaged"),
-    "text": (zed_with("fx=700.0", "fx=x"), r"SN12345\.conf: "),
-    "section": (zed_with("[STEREO]", "[MONO]"), r"SN12345\.conf: "),
-    "damaged section": (zed_with("[LEFT_CAM_HD]", "LEFT"), r"SN12345\.conf: "),
-    "nan": (zed_with("cy=355.0", "cy=nan"), r"SN12345\.conf: "),
-    "zero": (zed_with("fx=700.0", "fx=0"), r"SN12345\.conf: "),
-    "two calibrations": (two_calibrations, r"expected one calibration of .*, got SN12345\.conf, SN2\.conf"),
-    "columns": (stray_of_another_app, "odometry.csv: expected Stray Scanner's columns, there is no frame, x, y, z"),
+    "text": (other_zed(b"fx=700.0", b"fx=x"), CALIBRATION),
+    "section": (other_zed(b"[STEREO]", b"[MONO]"), CALIBRATION),
+    "damaged section": (other_zed(b"[LEFT_CAM_HD]", b"LEFT"), CALIBRATION),
+    "nan": (other_zed(b"cy=355.0", b"cy=nan"), CALIBRATION),
+    "zero": (other_zed(b"fx=700.0", b"fx=0"), CALIBRATION),
+    "two calibrations": (lambda folder: (captures.zed(folder) / "SN2.conf").touch(),
+                         r"expected one calibration of .*, got SN12345\.conf, SN2\.conf"),
+    "columns": (changed(captures.stray, "odometry.csv", lambda _: b"time,lat,lon\n1,2,3\n"),
+                "odometry.csv: expected Stray Scanner's columns, there is no frame, x, y, z"),
 }  # fmt: skip
 
 
@@ -722,11 +692,7 @@ def test_documentation_has_the_table_of_captures():
 def test_command_prints_the_captures_with_a_word(capsys):
     assert main(["formats", "r3d"]) == 0
     printed = capsys.readouterr().out
-    assert "Record3D" in printed
-    assert "Polycam" not in printed
-    for word in ("found", "tried", "sensor "):  # labels of the rows
-        assert main(["formats", word]) in (0, 2)
-        assert "Polycam" not in capsys.readouterr().out
+    assert ("Record3D" in printed, "Polycam" in printed) == (True, False)
     assert main(["formats"]) == 0
     printed = capsys.readouterr().out
     assert all(each.name in printed for each in registry.CAPTURES)

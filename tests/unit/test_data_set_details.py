@@ -15,7 +15,7 @@ from small_files import encoded_png as png
 from small_files import png_by_its_specification, written
 
 from dsr.data import arkitscenes, icl, sintel, sunrgbd, tartanair
-from dsr.data.eight_bit import NOTE, EightBit
+from dsr.data.eight_bit import EightBit
 from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import to_range
 
@@ -214,26 +214,6 @@ def test_bicubic_row_of_the_field_comes_out_on_lu(shared, scale, expected):
     assert np.mean(errors) == pytest.approx(expected, abs=1e-3)
 
 
-def test_thirty_pairs_of_middlebury_are_read(shared):
-    data = EightBit(str(shared / "modern"), "middlebury8")
-    assert len(data.scenes()) == 30
-    scene = data.load("Middlebury_30")
-    assert scene.notes == (NOTE,)
-    assert tuple(scene.depth.shape) == (1, 381, 432)
-    levels = scene.unit.convert(scene.depth)
-    assert (levels.min().item(), levels.max().item()) == pytest.approx((24, 134))
-
-
-def test_real_frames_of_rendered_sets_are_read(shared):
-    [files] = tartanair.find_frames(shared / "real/tartanair").values()
-    depth = tartanair.load_frame(*files, "tartanair", "000000").depth
-    assert not depth.isnan().any()
-    assert depth.median().item() == pytest.approx(1.838, abs=0.001)
-    folder = shared / "real/icl_nuim/living"
-    depth = icl.load_frame(folder / "rgb.png", folder / "depth.png", "icl_nuim", "living").depth
-    assert (depth.min().item(), depth.max().item()) == (1.641, 3.43)
-
-
 def test_depth_of_sun_rgbd_is_the_sensors_or_the_refined_one_of_one_picture_each(tmp_path, capfd):
     kind = write_frame("sunrgbd", tmp_path)
     refined = written(tmp_path / "kv2/x/depth_bfx/2.png", png(turned(ramp(384, 512, 8181))))
@@ -287,14 +267,6 @@ def test_nyu_crop_starts_at_column_40_and_row_44_as_its_intrinsics_say(shared):
     camera = sunrgbd.load_frame(folder, "sunrgbd", "a").camera
     counted_from_0 = cx - 1, cy - 1
     assert (counted_from_0[0] - best[0], counted_from_0[1] - best[1]) == pytest.approx((camera.cx, camera.cy))
-
-
-def test_pair_of_loose_files_is_read_with_intrinsics(shared):
-    folder = shared / "real/sunrgbd/open3d_sample"
-    scene = sunrgbd.load_pair(
-        folder / "SUN_color.jpg", folder / "SUN_depth.png", "sunrgbd", "sample", (570, 570, 320, 240)
-    )
-    assert scene.depth.nan_to_num(0).max().item() == 9.870  # beyond 8 m, not cut
 
 
 def test_scenes_behind_links_are_found_and_circular_links_are_harmless(tmp_path):

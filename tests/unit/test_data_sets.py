@@ -12,9 +12,16 @@ from small_files import written
 from dsr.data import hammer
 from dsr.data.ddrnet_frames import DDRNetFrames
 from dsr.data.detection import find_scenes
+from dsr.data.eight_bit import EightBit
 from dsr.data.hammer import Hammer
+from dsr.data.icl import ICL
+from dsr.data.middlebury import Middlebury, MiddleburyLevels
+from dsr.data.nyu import NYU
 from dsr.data.rgbdd import RGBDD, find_frames
 from dsr.data.sintel import Sintel
+from dsr.data.sunrgbd import SunRGBD
+from dsr.data.tartanair import TartanAir
+from dsr.data.tofmark import ToFMark
 
 FOREIGN = {
     "empty": b"", "text": b"text", "8 bits": png(np.full((9, 9), 7, np.uint8)), "small": png(ramp(9, 9, 900)),
@@ -148,14 +155,31 @@ def test_both_layouts_of_rgbdd_and_their_splits_are_found(tmp_path):
     assert not RGBDD(str(tmp_path), True, "train", "found").evaluation
 
 
-def test_real_frames_are_read(shared):
-    data = DDRNetFrames(str(shared / "real/ddrnet"))
-    assert data.scenes() == [f"frame_{number:06d}" for number in (1, 3, 5, 7, 9, 11)]
-    scene = data.load("frame_000001")
-    both = scene.depth.isfinite() & scene.measured[1].isfinite()
-    assert int(scene.depth.isfinite().sum()) == 480 * 640 - 258525
-    assert (scene.depth - scene.measured[1])[both].abs().median() < 0.005
-    assert len(RGBDD(str(shared / "modern/RGBDD"), real=False, scenes="found").scenes()) == 21
-    scene = RGBDD(str(shared / "real/rgbdd_real"), real=True, scenes="found").load("20200509112638")
-    [measured] = scene.measured.values()
-    assert abs(scene.depth.median() - measured.median()) < 0.05
+TOFMARK = {"intrinsics": [550.0, 550.0, 404.5, 304.5], "depth_range": [0.38, 0.93]}
+REAL = [
+    (TartanAir, "real/tartanair", {"size": None}, 1, "000000", (480, 640), [1.838]),
+    (ICL, "real/icl_nuim", {"size": None}, 2, "living", (480, 640), [3.028]),
+    (ICL, "real/icl_nuim", {"size": 64}, 2, "office_0000", (64, 64), [3.473]),
+    (EightBit, "modern", {"benchmark": "middlebury8"}, 30, "Middlebury_30", (381, 432), [2.310]),
+    (DDRNetFrames, "real/ddrnet", {}, 6, "frame_000001", (480, 640), [1.355, 1.353]),
+    (RGBDD, "modern/RGBDD", {"real": False}, 21, "20200509112638", (384, 512), [1.728]),
+    (RGBDD, "real/rgbdd_real", {"real": True}, 2, "20200509112638", (384, 512), [1.728, 1.745]),
+    (NYU, "modern/NYU", {"split": "test"}, 3, "1001", (480, 640), [2.962]),
+    (Middlebury, "real/middlebury2014", {"size": None}, 10, "artl", (277, 347), [1.776]),
+    (MiddleburyLevels, "real/middlebury2006", {"year": 2006, "size": None}, 8, "aloe", (370, 427), [2.308]),
+    (MiddleburyLevels, "real/middlebury2005", {"year": 2005, "size": None, "smooth": False}, 3, "art", (1088, 1376),
+     [1.776, 1.786, 1.786]),
+    (SunRGBD, "real/sunrgbd", {"size": None}, 2, "img_0063", (427, 561), [1.963]),
+    (ToFMark, "real/tofmark", TOFMARK, 3, "devil", (610, 810), [0.757, 0.763]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("make", "folder", "settings", "count", "name", "size", "medians"), REAL)
+def test_real_scenes_are_read_in_metres(shared, dsr_cache, make, folder, settings, count, name, size, medians):
+    """``medians``: of the depth, and of the measured maps."""
+    data = make(str(shared / folder), **{"scenes": "found", **settings})
+    assert len(data.scenes()) == count
+    scene = data.load(name)
+    maps = [each for each in (scene.depth, *scene.measured.values()) if each is not None]
+    assert [each.nanmedian().item() for each in maps] == pytest.approx(medians, abs=1e-3)
+    assert scene.rgb.shape[1:] == size

@@ -5,14 +5,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from dsr.data.icl import ICL
 from dsr.data.middlebury import EVALUATION_2014, TRAINING, Middlebury, MiddleburyLevels, MiddleburyTrain
 from dsr.data.rendered import Procedural, SimGeo
 from dsr.data.scene_source import Preparation
 from dsr.data.sunrgbd import SunRGBD
 from dsr.data.tofmark import SCENES as TOFMARK_SCENES
 from dsr.data.tofmark import ToFMark
-from dsr.methods.recipe import read_recipe
 from dsr.report.paper import published_row
 from dsr.synthetic.simgeo import SCENES as SIMGEO_SCENES
 from dsr.utils.configuration import ConfigError, build
@@ -97,14 +95,6 @@ def test_middlebury_has_the_scenes_of_the_paper_and_none_of_them_is_trained_on(t
 
 
 @pytest.mark.parametrize(
-    ("method", "range_type"),
-    [("bicubic", "perspective"), ("msg_v", "disparity"), ("facets", "disparity"), ("dip", "orthogonal")],
-)
-def test_method_gets_the_range_type_that_it_was_made_for(method, range_type):
-    assert read_recipe(method).kind.range_type == range_type
-
-
-@pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda root: MiddleburyLevels(root, 2007), "year: expected one of 2001, 2003, 2005, 2006, got 2007"),
@@ -122,23 +112,3 @@ def test_method_gets_the_range_type_that_it_was_made_for(method, range_type):
 def test_values_out_of_range_are_refused(tmp_path, make, message):
     with pytest.raises(ValueError, match=f"^{message}"):
         make(str(tmp_path))
-
-
-def test_real_scenes_of_every_dataset_are_prepared(shared, dsr_cache):
-    real = shared / "real"
-    sources = [
-        Middlebury(str(real / "middlebury2014"), ["recycle"], 64),
-        MiddleburyLevels(str(real / "middlebury2006"), 2006, ["aloe"], 64),
-        ICL(str(real / "icl_nuim"), ["office_0000"], 64),
-        SunRGBD(str(real / "sunrgbd"), ["img_0063"], 64),
-    ]
-    for data in sources:
-        [name] = data.scenes()
-        scene = data.load(name)
-        assert (scene.name, tuple(scene.depth.shape), tuple(scene.rgb.shape)) == (name, (1, 64, 64), (3, 64, 64))
-        assert 0.5 < scene.depth.nanmedian() < 12
-    devil = ToFMark(str(real / "tofmark"), depth_range=[0.4, 0.9]).load("devil")
-    assert tuple(devil.measured[8].shape) == (1, 76, 101)
-    assert (devil.camera.fx, devil.notes) == (549.2, ("the benchmark has no camera: it is an estimate",))
-    given = ToFMark(str(real / "tofmark"), None, [600.0, 600.0, 404.5, 304.5], [0.4, 0.9]).load("devil")
-    assert (given.camera.fx, given.notes) == (600.0, ())

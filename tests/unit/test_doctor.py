@@ -1,5 +1,6 @@
 """The doctor: a check finds the one fault that the test put in, with its number, and none finds any in sound scenes."""
 
+import json
 import math
 import re
 from dataclasses import replace
@@ -10,11 +11,11 @@ import pytest
 import torch
 from small_scenes import room
 
+from dsr.cli import main
 from dsr.doctor.scenes import CHECKS, examine, examine_directory, find_rounding, with_depth
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.io.images import read_rgb
 from dsr.sample import Scene
-from dsr.synthetic.simgeo import render_scene
 
 SIZE = 256
 CAMERA = Camera(SIZE, SIZE, 240.0, 240.0, 127.5, 127.5, baseline=0.2)
@@ -213,7 +214,7 @@ def test_swapped_intrinsics_are_found():
 
 
 def test_unrelated_photo_is_found(sound):
-    other = render_scene("cube_high_freq", SIZE).scene("simgeo", "cube").rgb
+    other = torch.from_numpy(np.indices((SIZE, SIZE)) // 37 % 2).float().sum(0).expand(3, -1, -1) / 2
     [finding] = [finding for finding in examine(replace(sound, rgb=other)) if finding.level != "ok"]
     assert (finding.check, finding.level) == ("registration", "warning")
     assert finding.message.startswith("the photo seems to show something else")
@@ -293,3 +294,44 @@ def test_directory_without_scenes_is_one_line_on_stderr_and_exit_code_2(tmp_path
     out, err = capsys.readouterr()
     assert out == ""
     assert re.fullmatch(rf"error: {re.escape(str(place))}: expected a scene or a directory of scenes, got .*\n", err)
+
+
+# The command
+
+
+@pytest.mark.command
+def test_findings_are_printed_with_advice(tmp_path, capsys):
+    small = room_scene(CAMERA.rescale(128, 128), 17.0)
+    depth, rays = small.depth[0].numpy(), small.camera.ray_lengths().numpy()
+    numbers = {name: getattr(small.camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    for name, values, entries in (
+        ("ray", depth * rays, {}), ("ray_described", depth * rays, {"range_type": "perspective"}),
+        ("unit", depth * 1000, {}), ("unit_described", depth * 1000, {"depth_unit": "mm"}),
+    ):  # fmt: skip
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "camera.json").write_text(json.dumps({**numbers, **entries}))
+        cv2.imwrite(str(tmp_path / name / "rgb.png"), 255 * small.rgb.permute(1, 2, 0).numpy()[..., ::-1])
+        np.save(tmp_path / name / "depth.npy", values)
+    assert main(["doctor", str(tmp_path)]) == 1
+    output, errors = capsys.readouterr()
+    assert errors == ""
+    text = " ".join(output.split())
+    assert "ray: 1 problem" in text
+    assert "depth looks like distance along the ray" in text
+    assert '-> set "range_type": "perspective" in camera.json' in text
+    assert "ray_described: fine" in text
+    assert "unit: 1 problem" in text
+    assert "-> x 0.001 would make the median" in text
+    assert "unit_described: fine" in text
+    assert output.endswith("4 scenes: 2 fine, 2 with problems\n")
+    assert main(["doctor", str(tmp_path), "--most", "2"]) == 1
+    assert capsys.readouterr().out.startswith("2 of 4 scenes, at equal distances\nray: 1 problem")
+
+
+def test_published_scenes_pass(shared, capsys):
+    assert main(["doctor", str(shared / "scenes")]) == 0
+    output, errors = capsys.readouterr()
+    assert errors == ""
+    for name in ("books", "lucy", "plant"):
+        assert f"{name}: fine" in output
+    assert output.endswith("3 scenes: 3 fine\n")

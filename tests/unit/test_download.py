@@ -4,21 +4,21 @@ import contextlib
 import hashlib
 import io
 import json
-import re
 import shutil
 import socket
 import tarfile
 import zipfile
-from collections import namedtuple
+from collections import Counter, namedtuple
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from urllib.parse import urlsplit
 
 import pytest
 from download_server import DATES, PNG, serving
 from small_files import written
 
-from dsr.cli import data_tasks, main
-from dsr.data.download import Collection, Item
+from dsr.cli import main
+from dsr.data.download import CATALOGUE, Collection, Item
 from dsr.data.download.fetching import Checksums, get, lock_directory, state, verify
 from dsr.utils.progress import Progress
 
@@ -96,19 +96,6 @@ def test_broken_connection_resumes_where_it_stopped(server, tmp_path):
     assert first is None
     assert 100_000 < second <= 200_000 < third <= second + 100_000  # at most a piece that was under way is lost
     assert server.log[-1][2] == len(PNG) - third
-
-
-def test_later_command_resumes_a_partial_file(server, tmp_path):
-    server.cuts = [200_000, 0]
-    one_line(fetched(picture(server), tmp_path), "set/a.png: ", f"{server.url}/a.png: ", "broke off")
-    had = (tmp_path / "set/a.png.part").read_bytes()
-    assert PNG.startswith(had)
-    assert len(had) > 100_000
-    assert not (tmp_path / "set/a.png").exists()
-    assert fetched(picture(server), tmp_path) == []
-    assert server.log[-1] == ("/a.png", f"bytes={len(had)}-", len(PNG) - len(had))
-    assert (tmp_path / "set/a.png").read_bytes() == PNG
-    assert left_in(tmp_path) == ["set/a.png"]
 
 
 @pytest.mark.parametrize(
@@ -417,33 +404,6 @@ def test_second_command_is_refused_while_one_writes(server, tmp_path):
     assert fetched(picture(server), tmp_path) == []
 
 
-def test_list_shows_which_checksums_are_pinned_noted_and_unknown(server, tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("DSR_DATA", str(tmp_path))
-    server.files |= {"/b.png": PNG, "/c.png": PNG}
-    items = [replace(picture(server, f"/{name}.png", name=f"{name}.png"), sha256=digest)
-             for name, digest in (("a", sha256(PNG)), ("b", None), ("c", None))]  # fmt: skip
-
-    def of(items, name):
-        return Collection(name, "A set", "", "", "", ("set",), None, tuple(items))
-
-    catalogue = {name: of(some, name) for name, some in (("all", items), ("one", items[:1]), ("two", items[1:2]))}
-    catalogue["mine"] = replace(
-        catalogue["one"], items=(), manual="put it there", patterns=("*.png",), folders=("mine",)
-    )
-    monkeypatch.setattr(data_tasks, "downloads", lambda: catalogue)
-
-    def listed():
-        assert main(["data", "list"]) == 0
-        return [re.split(r" {2,}", line.strip())[-1] for line in capsys.readouterr().out.splitlines()[1:]]
-
-    assert listed() == ["1 pinned, 2 unknown", "pinned", "unknown", "unknown"]
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "x.png").write_bytes(PNG)
-    assert main(["data", "get", "two", "mine", "--yes"]) == 0
-    capsys.readouterr()
-    assert listed() == ["1 pinned, 1 noted, 1 unknown", "pinned", "noted", "noted"]
-
-
 @pytest.mark.parametrize("given", ["mirror.example/x", "ftp://mirror.example", "https://me:s3cret@mirror.example/x"])
 def test_mirror_that_is_no_address_or_has_a_password_is_refused(tmp_path, monkeypatch, capsys, given):
     monkeypatch.setenv("DSR_DATA", str(tmp_path))
@@ -452,3 +412,52 @@ def test_mirror_that_is_no_address_or_has_a_password_is_refused(tmp_path, monkey
     [line] = captured.err.splitlines()
     assert "--mirror: expected an address that begins with http" in line
     assert "s3cret" not in captured.out + line
+
+
+# The catalogue
+
+
+ITEMS = [item for collection in CATALOGUE.values() for item in collection.items]
+
+
+def test_collection_has_terms_and_files_in_its_folders_or_says_how_to_get_them():
+    for name, collection in CATALOGUE.items():
+        assert collection.name == name
+        assert all((collection.homepage, collection.title, collection.licence, collection.citation))
+        assert bool(collection.items) != bool(collection.manual and collection.patterns)
+        paths = [item.path for item in collection.items]
+        assert {path.split("/")[0] for path in paths} == (set(collection.folders) if paths else set())
+        assert len(set(paths)) == len(paths)
+
+
+def test_items_have_addresses_of_their_names_and_paths_below_the_root():
+    assert len(ITEMS) > 200
+    for item in ITEMS:
+        assert not PurePosixPath(item.path).is_absolute()
+        assert ".." not in item.path
+        assert item.urls
+        for url in item.urls:
+            address = urlsplit(url)
+            assert address.scheme in ("http", "https")
+            assert " " not in url
+            name = (address.fragment or address.path).rpartition("/")[2]
+            assert name == PurePosixPath(item.path).name or item.unpack_to is not None
+        assert (item.unpack_to is None) == (not item.path.endswith((".zip", ".tar.gz")))
+        assert bool(item.contains) == (item.unpack_to is not None)
+
+
+def test_files_of_a_commit_are_pinned_and_the_shared_ones_are_these(shared):
+    pinned = {item.path: item.sha256 for item in ITEMS if item.sha256 is not None}
+    counts = Counter(path.split("/")[0] for path in pinned)
+    assert counts == {
+        "lu": 2 * 6, "middlebury8": 2 * 30, "ddrnet": 3 * 22, "stereo_board": 2 * 5, "cleargrasp": 4 * 4 + 1,
+        "cleargrasp_synthetic": 3 * 3,
+    }  # fmt: skip
+    for item in ITEMS:
+        assert (item.sha256 is not None) == ("raw.githubusercontent.com" in item.urls[0])
+    folders = (("lu", "modern/Lu"), ("middlebury8", "modern/Middlebury"), ("stereo_board", "real/stereo_board"))
+    for ours, theirs in folders:
+        for path, digest in pinned.items():
+            folder, _, name = path.partition("/")
+            if folder == ours:
+                assert hashlib.sha256((shared / theirs / name).read_bytes()).hexdigest() == digest

@@ -12,7 +12,7 @@ from dsr.geometry.surface import lights
 from dsr.pictures import canvas, lights_figure
 from dsr.pictures.depth_views import Window, strongest_window
 from dsr.report import figures as figures_of_runs
-from dsr.report.figures import KINDS, Figures, details_of, draw_page, pages_of
+from dsr.report.figures import Figures, details_of, draw_page, pages_of
 from dsr.report.worker_pool import WorkerPool
 
 pytestmark = pytest.mark.slow  # drawing takes a second
@@ -140,26 +140,6 @@ def test_scores_are_in_thousandths_and_the_best_is_bold(results, drawn, tmp_path
     shown = [int(text.get_text().split(" / ")[0]) for text in captions[:3]]
     assert shown == [round(1000 * value) for value in table["value"]]
     assert [text.get_weight() == "bold" for text in captions[:3]] == [value == min(shown) for value in shown]
-
-
-def test_scene_that_no_run_stores_is_left_out_with_a_note(results, drawn, tmp_path):
-    for path in (tmp_path / "runs").glob("*/scenes/two.npz"):
-        path.unlink()
-    notes = []
-    save_grids(tmp_path, results, *KINDS, notes=notes)
-    assert set(notes) == {"simgeo/two x4 box: no pictures, because no run has stored photo and input"}
-    assert all(not panels(figure, "two") and panels(figure, "one") for figure in drawn.values())
-
-
-def test_results_that_cannot_be_drawn_are_left_out_with_a_note(results, drawn, tmp_path):
-    change(tmp_path / "runs" / "a" / "predictions" / "one.npz", depth=np.ones((7, 24)))
-    (tmp_path / "runs" / "b" / "predictions" / "one.npz").write_bytes(b"damaged")
-    notes = []
-    save_grids(tmp_path, results, "depth", notes=notes)
-    assert len(notes) == 2
-    assert any("expected maps of the photo's 24 x 24 pixels, got 7 x 24" in note for note in notes)
-    assert any(str(tmp_path / "runs" / "b" / "predictions" / "one.npz") in note for note in notes)
-    assert len(empty_panels(drawn["depth_simgeo_x4_box_1"], "one")) == 2
 
 
 def test_figure_of_lights_shows_their_closed_form(drawn, tmp_path):

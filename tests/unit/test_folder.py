@@ -182,6 +182,12 @@ REFUSED = {
         for value in (0, -1)
     },
     **{
+        f"a {name} of {value}": (
+            {f"{name}.npy": with_values(Z, (0, 0, value))}, STEREO,
+            f"/{name}.npy: expected depths of 1e-06 to 1e.09 m, got .* in 3.1.% of the pixels")
+        for name, value in (("depth", 1e19), ("depth", 1e-9), ("disparity", 1e-12))
+    },
+    **{
         f"a disparity of {value}": (
             {"disparity.npy": with_values(Z, (0, 0, value))}, {**STEREO, "doffs": 3.0}, ".*positive values")
         for value in (-3.0, -4.0)

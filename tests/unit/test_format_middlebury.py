@@ -4,7 +4,6 @@ import re
 
 import numpy as np
 import pytest
-import torch
 from data_set_files import pfm, photo, write_frame
 from small_files import encoded_png as png
 from small_files import written
@@ -102,26 +101,3 @@ def test_levels_that_do_not_fit_are_refused_in_one_line(tmp_path, height, shift,
     write_frame("middlebury2006", tmp_path, disp1_png=png(np.ones((height, 40), np.uint8)), dmin_txt=shift)
     with pytest.raises(ValueError, match=message):
         load_levels(find_levels(tmp_path)["aloe"], "middlebury2006", "aloe", 2006)
-
-
-def test_real_scenes_of_2014_are_read(shared):
-    found = find_2014(shared / "real" / "middlebury2014")
-    assert len(found) == 10
-    scene = load_2014(found["recycle"], "middlebury", "recycle")
-    assert scene.rgb.shape == (3, 486, 720)
-    assert 1.2 < scene.depth.nanmedian() < 2.6
-    assert scene.depth.isnan().double().mean() == pytest.approx(0.0167, abs=1e-3)
-
-
-def test_real_scenes_of_2005_and_2006_are_read(shared):
-    found = find_levels(shared / "real" / "middlebury2006")
-    scene = load_levels(found["aloe"], "middlebury2006", "aloe", 2006)
-    assert (len(found), scene.rgb.shape) == (8, (3, 370, 427))
-    assert scene.depth.isnan().double().mean() == pytest.approx(0.029, abs=1e-3)
-    scene = load_levels(find_levels(shared / "real" / "middlebury2005")["art"], "middlebury2005", "art", 2005)
-    assert scene.rgb.shape == (3, 1088, 1376)
-    sizes = {factor: tuple(coarse.shape) for factor, coarse in scene.measured.items()}
-    assert sizes == {4: (1, 272, 344), 8: (1, 136, 172)}
-    kit = load_2014(find_2014(shared / "real" / "middlebury2014")["artl"], "middlebury", "artl")
-    torch.testing.assert_close(scene.depth.nanmedian(), kit.depth.nanmedian(), rtol=0.01, atol=0)
-    torch.testing.assert_close(scene.measured[4].nanmedian(), scene.depth.nanmedian(), rtol=0.02, atol=0)

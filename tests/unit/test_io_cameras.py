@@ -156,29 +156,6 @@ def camera_file(folder, **changes):
     return written(folder, "camera.json", entries)
 
 
-def test_camera_file_is_read_in_pixels_and_metres(tmp_path):
-    path = camera_file(
-        tmp_path, range_type="disparity", baseline=160, baseline_unit="mm", doffs=2.5, depth_unit="mm", hole_value=0
-    )
-    described = read_camera(path)
-    camera = described.camera
-    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (64, 48, 60, 61, 31, 24)
-    assert camera.baseline == pytest.approx(0.16, rel=1e-15)
-    assert camera.doffs == 2.5
-    assert (described.range_type, described.depth_unit, described.hole_value) == ("disparity", 0.001, 0.0)
-
-
-def test_camera_file_of_intrinsics_alone_is_enough(tmp_path):
-    described = read_camera(camera_file(tmp_path))
-    assert (described.camera.baseline, described.camera.doffs) == (None, 0)
-    assert (described.range_type, described.depth_unit, described.hole_value) == (None, None, None)
-
-
-@pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("mm", 0.001), (0.0002, 0.0002), (5, 5.0)])
-def test_depth_unit_is_m_mm_or_a_number(tmp_path, unit, metres):
-    assert read_camera(camera_file(tmp_path, depth_unit=unit)).depth_unit == metres
-
-
 @pytest.mark.parametrize(
     ("key", "value"),
     [

@@ -337,13 +337,13 @@ def test_values_beyond_16_bits_of_a_millimetre_become_counted_holes():
 def test_maps_of_sensors_in_millimetres_and_metres_are_never_asked_about(shared):
     """Each is read in both, as it is and as floats; nothing is warned of."""
     paths = [
-        *sorted((shared / "modern" / "RGBDD" / "Depth").glob("*.png"))[::4],
+        *sorted((shared / "modern" / "RGBDD" / "Depth").glob("*.png"))[::8],
         *(shared / "real" / "depth_camera").glob("*/raw_depth.png"),
-        *sorted((shared / "real" / "ddrnet").glob("*depth*/*.png"))[::4],
+        *sorted((shared / "real" / "ddrnet").glob("*depth*/*.png"))[::8],
         *(shared / "real" / "stereo_board" / "depth").glob("*.png"),
         shared / "real" / "iphone_lidar" / "arkit_depth.png",
     ]
-    assert len(paths) > 15
+    assert len(paths) > 10
     for path in paths:
         values = read_depth_file(path)
         holes = find_holes(values, None)[0]

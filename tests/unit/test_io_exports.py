@@ -194,12 +194,6 @@ def test_glb_mesh_from_near_to_far_has_positions_as_floats(tmp_path):
     assert set(tree["nodes"][0]) == {"mesh"}
 
 
-def test_meshes_are_cut_at_steps(tmp_path):
-    depth = wall()
-    depth[0, :, 12:] = 3
-    assert write_mesh(tmp_path / "m.ply", photo(), depth, CAMERA).after == 2 * 17 * 22
-
-
 def test_map_without_two_neighbours_is_refused_and_an_older_file_is_kept(tmp_path):
     depth = torch.full_like(wall(), torch.nan)
     depth[0, 3, 3] = 2

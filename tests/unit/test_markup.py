@@ -13,7 +13,6 @@ from small_runs import hostile_run, made_up_run
 from dsr.evaluation.results import Results
 from dsr.evaluation.run_files import load_results
 from dsr.report.correlations import save_scatter_matrix
-from dsr.report.study.percentages import PERCENTAGES, read_study
 from dsr.report.table_layouts import MISSING, escaped, latex_text, to_csv, to_document, to_latex, to_markdown
 from dsr.report.tables import build_tables
 
@@ -209,10 +208,3 @@ def test_figures_show_names_that_look_like_formulas_of_tex(hostile, tmp_path):
     more = dataclasses.replace(hostile.runs[0], label="$\\frac$ $x", folder=hostile.runs[0].folder)
     both = dataclasses.replace(hostile, runs=(hostile.runs[0], more))
     assert all(path.stat().st_size > 1000 for path in save_scatter_matrix(both, tmp_path / "figures"))
-
-
-def test_study_is_read_with_its_names(tmp_path):
-    shares = dict.fromkeys(PERCENTAGES, 50.0)
-    about = {"dataset": "-1", "scene": "@x", "scale": 4, "downsampling": "box", "label": HOSTILE}
-    (tmp_path / "study.csv").write_text(pd.DataFrame([{**about, **shares}]).to_csv(index=False))
-    assert read_study(tmp_path / "study.csv").iloc[0][[*about]].to_dict() == about

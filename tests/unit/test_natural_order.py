@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from dsr.cli import main
-from dsr.data import arkitscenes, ddrnet_frames, icl, rgbdd, sintel, sunrgbd, tartanair, tofmark
 from dsr.data.folder import Folder
 from dsr.io.inputs import Reading, read_picture
 from dsr.io.layouts import find_pairs_of_folder
@@ -171,34 +170,6 @@ def test_photos_in_an_order_of_the_users_own_keep_it(folder, tmp_path, capsys):
     capsys.readouterr()
     poses = [json.loads((tmp_path / "out" / f"{number}" / "info.json").read_text())["pose"] for number in order]
     assert pose_numbers(np.array(poses)) == list(range(FRAMES))
-
-
-DATA_SETS = {
-    "icl": (icl.find_frames, ("a/scene_00_{}.png", "a/scene_00_{}.depth")),
-    "icl folders": (icl.find_frames, ("a{}/rgb.png", "a{}/depth.png")),
-    "sunrgbd": (sunrgbd.find_frames, ("{}/image/a.jpg", "{}/depth/a.png")),
-    "tartanair": (tartanair.find_frames, ("{}_left.png", "{}_left_depth.npy")),
-    "sintel": (sintel.find_frames, ("final/a/frame_{}.png", "depth/a/frame_{}.dpt", "camdata_left/a/frame_{}.cam")),
-    "tofmark": (tofmark.find_frames, ("a{}.bmp", "a{}_depth.bmp")),
-    "ddrnet": (ddrnet_frames.find_frames, ("color_map/{}.png", "depth_map/{}.png", "high_quality_depth/{}.png")),
-    "rgbdd": (rgbdd.find_frames, ("RGB/{}_RGB.jpg", "Depth/{}_HR_gt.png")),
-    "arkitscenes": (arkitscenes.find_frames,
-                    ("wide/7_{}.5.png", "highres_depth/7_{}.5.png", "lowres_depth/7_{}.5.png")),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("dataset", DATA_SETS)
-def test_scenes_of_a_data_set_are_in_the_order_of_their_numbers(tmp_path, dataset):
-    find, files = DATA_SETS[dataset]
-    for number in range(1, FRAMES + 1):
-        for file in files:
-            path = tmp_path / file.format(number)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.touch()
-    names = list(find(tmp_path))
-    found = [int(re.search(r"\d+", name.removeprefix("7_").removeprefix("a/"))[0]) for name in names]
-    assert len(found) == FRAMES
-    assert found == sorted(found)
 
 
 def test_key_sorts_numbers_by_value_and_paths_folder_by_folder():

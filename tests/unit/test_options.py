@@ -66,7 +66,7 @@ def test_wrong_value_is_named_as_a_flag_and_as_an_argument(words, name, wrong, m
         ("--depth-unit ell", "--depth-unit: expected m, cm, mm or "),
         ("--extrinsics m.txt", "--extrinsics: expected --depth-camera with it"),
         ("--for robot --fill small", "--for robot: expected --fill none or none with it, got --fill small"),
-        ("--only nothing", "--only, --with, --without: expected some of depth, .*, got 'nothing'"),
+        ("--only nothing", "--only: expected some of depth, .*, got 'nothing'"),
     ],
 )
 def test_value_that_cannot_be_used_is_one_line_with_the_flag(words, message):
@@ -86,11 +86,7 @@ def test_options_that_go_together_and_one_that_stands_for_others():
     ("words", "said"),
     [
         ("upsample -o out --fill some", "--fill: expected one of "),
-        ("upsample -o out --fov wide", "--fov: invalid float"),
-        ("upsample -o out --intrinsics 1 2 3", "--intrinsics: expected 4 arguments"),
         ("upsample -o out --fov 60 --camera c.json", "--camera: not allowed with argument --fov"),
-        ("upsample a", "required: -o/--output"),
-        ("upsample -o out --rgb", "--rgb: expected at least one"),
         ("upsample -o out --rgb= --depth d.png", "--rgb: expected a path, got an empty text"),
         ("study build RUNS= -o out", ""),
     ],

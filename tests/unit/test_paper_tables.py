@@ -243,7 +243,7 @@ def test_study_columns_join_with_their_intervals_and_higher_is_better():
 
 
 def test_study_file_round_trips(tmp_path):
-    study = study_of(("m", "01", "None", 80.0, 70, 90), ("m", "a", "A", 20.0, math.nan, math.nan))
+    study = study_of(("-1", "01", "None", 80.0, 70, 90), ("m", "@x", "=cmd|'A'!A0", 20.0, math.nan, math.nan))
     study.to_csv(tmp_path / "study.csv", index=False)
     pd.testing.assert_frame_equal(read_study(tmp_path / "study.csv"), study, check_dtype=False)
 

@@ -1,14 +1,13 @@
 """Data sets in their owners' formats: which scenes, prepared how, kept where."""
 
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 import dsr.data.scene_source as module
-from dsr.data.scene_source import Preparation, PreparedDataset, SceneRecord, make_records
+from dsr.data.scene_source import Preparation, PreparedDataset, make_records
 from dsr.geometry.camera import Camera
 from dsr.sample import Scene
 from dsr.synthetic import cache_directory
@@ -160,15 +159,3 @@ def test_folder_fingerprint_covers_all_files_and_large_ones_by_size_and_time(fil
         os.utime(files["deep/c"][0], (changed, changed))
         contents.append(data.content("all"))
     assert (contents[0] == contents[1], len(set(contents))) == (True, 3)
-
-
-def test_record_without_high_resolution_depth_cannot_be_resized(files):
-    def measured_only():
-        return Scene("things", "a", torch.zeros(3, 60, 90), Camera(90, 60, 80.0, 80.0, 44.5, 29.5), None,
-                     {2: torch.ones(1, 30, 45)})  # fmt: skip
-
-    data = PreparedDataset("things", Path("x"), {"a": SceneRecord((), measured_only)}, None, ["a"], Preparation(48))
-    with pytest.raises(
-        ValueError, match=r"a: expected a high-resolution depth map to resize, there is none \(dataset\.size=null\)"
-    ):
-        data.load("a")

@@ -10,12 +10,14 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from small_runs import made_up_run
 
 from dsr.evaluation.results import Results
 from dsr.evaluation.run_files import load_results
 from dsr.geometry.surface import render
+from dsr.metrics.formats import MetricFormat
 from dsr.pictures.depth_views import normals_seen_by
-from dsr.report.page import Pictures, save_page
+from dsr.report.page import Pictures, save_page, standings
 from dsr.report.page_scenes import PictureStore
 from dsr.report.worker_pool import WorkerPool
 
@@ -122,14 +124,6 @@ def test_calibration_compares_expected_and_measured_errors_of_all_scenes(make_ru
     assert len(row["angle"]["ratios"]) == 10
 
 
-def test_limits_of_errors_and_depth_are_the_same_for_all_methods(make_run, tmp_path):
-    runs = [make_run(tmp_path / "runs" / name, method=name, label=name) for name in ("a", "b")]
-    _, _, scene = saved(tmp_path, load_results(runs))
-    assert [surface["label"] for surface in scene["surfaces"]] == ["input", "a", "b", "truth"]
-    assert scene["error"]["limit"] <= scene["error"]["largest"]
-    assert not any("limit" in surface["error"] for surface in scene["surfaces"][1:3])
-
-
 def test_large_pictures_are_reduced_and_the_page_says_so(make_run, tmp_path):
     workers = WorkerPool(load_results([make_run(tmp_path / "run", size=64)]))
     notes = save_page(tmp_path / "small.html", Pictures(workers, 20))
@@ -137,15 +131,6 @@ def test_large_pictures_are_reduced_and_the_page_says_so(make_run, tmp_path):
     assert notes[0] in json.loads(blocks(tmp_path / "small.html")["data"])["notes"]
     assert json.loads(blocks(tmp_path / "small.html")["s0"])["surfaces"][1]["size"] == [16, 16]
     assert save_page(tmp_path / "large.html", Pictures(workers))[0].startswith("pictures: lossless, 8 bits;")
-
-
-def test_pictures_of_many_surfaces_are_smaller_unless_a_size_is_given(make_run, tmp_path, monkeypatch):
-    workers = WorkerPool(load_results([make_run(tmp_path / "run", size=64)]))
-    assert Pictures(workers).longest == 1024
-    monkeypatch.setattr("dsr.report.page._MOST_PIXELS", 300)
-    surfaces = 3 * len(Pictures(workers).places)
-    assert Pictures(workers).longest == math.isqrt(300 // surfaces)
-    assert Pictures(workers, 512).longest == 512
 
 
 def test_reduced_values_are_averages_of_valid_pixels():
@@ -177,13 +162,15 @@ def test_run_without_stored_scenes_has_tables_and_says_why_no_pictures(make_run,
     assert not any(name.startswith("p") for name in content)
 
 
-def test_damaged_prediction_is_left_out_and_named(make_run, tmp_path):
-    runs = [make_run(tmp_path / name, method=name, label=name) for name in ("a", "b")]
+def test_predictions_that_are_damaged_or_of_another_size_are_left_out_and_named(make_run, tmp_path):
+    runs = [make_run(tmp_path / name, method=name, label=name) for name in ("a", "b", "c")]
     results = load_results(runs)
     (runs[1] / "predictions" / "cube_no_texture.npz").write_bytes(b"PK")
+    np.savez(runs[2] / "predictions" / "cube_no_texture.npz", depth=np.ones((7, 24)), config="{}", seconds=1.0)
     _, data, scene = saved(tmp_path, results)
     assert [surface["label"] for surface in scene["surfaces"]] == ["input", "a", "truth"]
-    assert any("expected a prediction" in note for note in data["notes"])
+    for text in (f"{runs[1]}/predictions/cube_no_texture.npz: expected a prediction", "32 x 32 pixels, got 7 x 24"):
+        assert any(text in note for note in data["notes"]), data["notes"]
 
 
 def test_result_whose_expected_errors_do_not_fit_is_shown_without_them(make_run, tmp_path):
@@ -196,10 +183,31 @@ def test_result_whose_expected_errors_do_not_fit_is_shown_without_them(make_run,
     assert any("cube_no_texture" in note for note in data["notes"])
 
 
-def test_scene_without_truth_has_renderings_and_no_errors(make_run, tmp_path):
-    [run] = load_results([make_run(tmp_path / "run")]).runs
-    stored = dataclasses.replace(run.sample("cube_no_texture"), depth=None)
-    _, _, scene = saved(tmp_path, Results((changed(run, sample=lambda _: stored),)))
-    assert [surface["kind"] for surface in scene["surfaces"]] == ["input", "method"]
-    assert "error" not in scene
-    assert "error" not in scene["surfaces"][1]
+# The standings
+
+
+FORMATS = {
+    "RMSE_d": MetricFormat("RMSE_d", "mm", 1e3, 1, position=1),
+    **{name: MetricFormat(name, digits=2, higher_is_better=True, family="sharp") for name in ("F1", "F2", "F3")},
+}
+
+
+def run(label, values, dataset="mine"):
+    return made_up_run(label, values, dataset=dataset, formats=FORMATS)
+
+
+def test_families_weigh_the_same_and_directions_are_heard():
+    near = run("Near", {"hall": {"RMSE_d": 0.01, "F1": 0.1, "F2": 0.1, "F3": 0.1}})
+    sharp = run("Sharp", {"hall": {"RMSE_d": 0.02, "F1": 0.9, "F2": 0.9, "F3": 0.9}})
+    rows = standings(Results((near, sharp)))
+    assert [row["rank"] for row in rows] == [1.5, 1.5]
+    assert rows[0]["values"]["RMSE_d"] == [pytest.approx(10)]
+
+
+def test_method_without_a_setting_stands_last_and_without_means():
+    one, two = (run(name, {"hall": {"RMSE_d": value}}) for name, value in (("One", 0.03), ("Two", 0.02)))
+    more = run("One", {"lake": {"RMSE_d": 0.05}}, dataset="other")
+    rows = standings(Results((one, two, more)))
+    assert [(row["method"], row["settings"]) for row in rows] == [("One", 2), ("Two", 1)]
+    assert rows[0]["values"]["RMSE_d"] == [pytest.approx(40)]
+    assert rows[1]["values"] == {}

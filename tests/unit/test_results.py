@@ -71,26 +71,6 @@ def test_newer_of_two_predictions_counts_with_a_note(make_run, tmp_path):
     assert ": s; " in note
 
 
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("summary.json", "{"), ("summary.json", "[]"), ("summary.json", "{}"), ("versions.json", "x"),
-        ("scores.csv", "a,b\n1,2\n"), ("scores.csv", ""),
-        ("scores.csv", "dataset,scene,scale,downsampling,method,seed,metric,variant,value,valid_share\na,b,x,,,,,,,\n"),
-        ("scores.csv", "dataset,scene,scale,downsampling,method,seed,metric,variant,value,valid_share\n"
-         "a,s,4,box,b,0,RMSE_d,,1e308,1\n"),
-    ],
-)  # fmt: skip
-def test_damaged_run_is_left_out_and_the_others_are_read(make_run, tmp_path, name, content):
-    make_run(tmp_path / "fine", scenes=("s",))
-    make_run(tmp_path / "damaged", scenes=("s",), label="MSG")
-    (tmp_path / "damaged" / name).write_text(content)
-    results = load_results([tmp_path])
-    assert results.methods() == ["Bicubic"]
-    (note,) = results.notes
-    assert str(tmp_path / "damaged" / name) in note
-
-
 def test_directory_without_runs_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"expected runs of eval.py .*found none"):
         load_results([tmp_path])

@@ -15,7 +15,6 @@ from dsr.geometry.camera import Camera
 from dsr.io.depth_files import write_depth_file
 from dsr.io.scene_files import (
     Frame,
-    parse_pose,
     to_millimetres,
     write_open3d,
     write_rerun,
@@ -130,13 +129,6 @@ def test_transforms_are_read_as_nerfstudio_reads_them(make, tmp_path, second):
     assert ("fl_x" in first) == (second == CAMERA)
 
 
-@pytest.mark.parametrize(("part", "write"), [("nerfstudio", write_transforms), ("gaussian", write_splatting)])
-def test_frames_without_poses_are_refused_in_one_line(make, tmp_path, part, write):
-    with pytest.raises(ValueError, match=rf"^{part}: expected a pose of each frame, got none for 1 of 2, .*room/001"):
-        write(tmp_path / "made", [make(0), make(1, pose=None)])
-    assert not (tmp_path / "made").exists()
-
-
 def test_open3d_folder_has_colour_depth_intrinsics_and_trajectory(make, tmp_path):
     frames = [make(0), make(1)]
     files = write_open3d(tmp_path / "o", frames)
@@ -230,23 +222,6 @@ def test_rerun_recording_is_read_back(make, tmp_path):
         np.testing.assert_allclose(photo[4:, :, 2], 255 * number / 10, atol=4)
     assert columns["/camera/depth", "frame"] == [0, 1]
     assert ("/camera/depth", "time") not in columns
-
-
-@pytest.mark.parametrize(
-    "value",
-    [
-        "no list",
-        [[1, 0], [0, 1]],
-        [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]],
-        [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]],
-        [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
-        [[float("nan"), 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
-        [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 1]],
-    ],
-)
-def test_pose_that_is_not_rigid_is_refused(value):
-    with pytest.raises(ValueError, match=r"^info.json: pose: expected a rigid transform of 4 x 4 numbers, got "):
-        parse_pose("info.json: pose", value)
 
 
 def test_damaged_depth_of_a_frame_is_refused(make):

@@ -17,7 +17,7 @@ import torch
 from dsr.degradation.downsampling import Downsampling, Measured, make_sample
 from dsr.degradation.noise import GaussianMultiplicative
 from dsr.evaluation.results import load_prediction
-from dsr.evaluation.scenes import SCORE_COLUMNS, Evaluation, StalePredictionError, evaluate_scene, write_tables
+from dsr.evaluation.scenes import Evaluation, StalePredictionError, evaluate_scene, write_tables
 from dsr.geometry.camera import Camera
 from dsr.methods.base import Method, NoSolutionError
 from dsr.metrics.catalogue import catalogue, score_image
@@ -129,23 +129,6 @@ def test_run_writes_predictions_in_metres_with_their_config_scores_and_a_summary
     blocks = RAMP[0].numpy().reshape(8, 2, 8, 2).mean(axis=(1, 3))
     np.testing.assert_allclose(depth, np.kron(blocks, np.ones((2, 2))), rtol=1e-12)
     assert config == {"method": {"name": "toy"}, "scale": SCALE, "scene": "a", "scene_content": "a-1"}
-
-
-def test_scores_csv_has_the_documented_columns_metrics_and_variants(tmp_path):
-    run(toy_study(tmp_path))
-    header = (tmp_path / "scores.csv").read_text().splitlines()[0]
-    assert header == "dataset,scene,scale,downsampling,method,seed,metric,variant,value,valid_share"
-    assert header.split(",") == list(SCORE_COLUMNS)
-    table = rows(tmp_path)
-    by_light = ("e1", "e2", "e3", "e4", "max", "avg")
-    expected = {(each.name, v) for each in catalogue() for v in (by_light if each.per_light else ("",))}
-    for scene in ("a", "b"):
-        mine = [row for row in table if row["scene"] == scene]
-        assert {(row["metric"], row["variant"]) for row in mine} == expected
-        assert len(mine) == len(expected)
-    for row in table:
-        assert (row["dataset"], row["scale"], row["downsampling"]) == ("toy", "2", "box")
-        assert (row["method"], row["seed"], row["valid_share"]) == ("toy_method", "7", "1.0")
 
 
 def test_scores_are_those_of_the_stored_prediction(tmp_path):

@@ -116,6 +116,15 @@ def test_configuration_of_anything_but_plain_values_is_refused(evil, text):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("seed", "abc"), ("scale", None), ("trainer", 5), ("model", "msg_v"), ("start", 5), ("names", {"model": "msg_v"})],
+)
+def test_value_of_another_type_is_refused_by_its_key(tmp_path, key, value):
+    with pytest.raises(ConfigError, match=rf"config\.yaml: {key}"):
+        read_config(write(tmp_path / "run", **{key: value}))
+
+
 @pytest.mark.parametrize("name", ["../../up", "/etc/x", "a\\b", "..", "", "a\nb", "x" * 200])
 def test_name_that_leads_out_of_a_folder_is_refused(tmp_path, name):
     for changes in ({"names__model": name}, {"names__dataset": name}, {"validation": {name: CONFIG["dataset"]}}):

@@ -9,11 +9,9 @@ import zlib
 
 import numpy as np
 import pytest
-import torch
 from small_results import CAMERA, HOLE, waves
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.mesh import triangulate
 from dsr.report.surface_page import (
     Grid,
     ViewedResult,
@@ -43,60 +41,14 @@ def unpack(about, text):
     return inverse, planes[3], planes[4:]
 
 
-def grid(depth, doubtful=None):
-    doubtful = np.zeros(depth.shape, bool) if doubtful is None else doubtful
-    certain = find_joints(np.where(doubtful, np.nan, depth), 1)
-    return Grid(depth.astype(float), CAMERA, 1, find_joints(depth, 1), doubtful, certain, {})
-
-
-def faces_by(flags, inverse, right, below):
-    """Return the triangles that the flags allow, as sets of three pixels."""
-    height, width = inverse.shape
-    found = set()
-    change = lambda i, j: np.nan_to_num(abs(inverse.flat[i] - inverse.flat[j]), nan=np.inf)  # noqa: E731
-    for v in range(height - 1):
-        for u in range(width - 1):
-            a, c = v * width + u, (v + 1) * width + u
-            b, d = a + 1, c + 1
-            top, left = flags[v, u] & right, flags[v, u] & below
-            bottom, end = flags[v + 1, u] & right, flags[v, u + 1] & below
-            if not change(a, d) > change(c, b):
-                found |= {(a, c, d)} if left and bottom else set()
-                found |= {(a, d, b)} if top and end else set()
-            else:
-                found |= {(a, c, b)} if left and top else set()
-                found |= {(c, d, b)} if bottom and end else set()
-    return {tuple(sorted(face)) for face in found}
-
-
-def faces_of(depth, camera=CAMERA):
-    mesh = triangulate(torch.from_numpy(depth)[None].double(), camera)
-    return {tuple(sorted(mesh.pixels[face])) for face in mesh.faces}
-
-
 def test_inverse_depth_is_read_back_to_24_bits():
-    depth = waves()
-    inverse, _, _ = unpack(*pack_grid(grid(depth)))
+    depth, joints = waves(), find_joints(waves(), 1)
+    grid = Grid(depth.astype(float), CAMERA, 1, joints, np.zeros(depth.shape, bool), joints, {})
+    inverse, _, _ = unpack(*pack_grid(grid))
     np.testing.assert_array_equal(np.isnan(inverse), np.isnan(depth))
     expected = 1 / depth.astype(float)
     step = (np.nanmax(expected) - np.nanmin(expected)) / (2**24 - 2)
     assert np.nanmax(np.abs(inverse - expected)) <= 0.51 * step
-
-
-@pytest.mark.parametrize("kind", ["certain", "all"])
-def test_flags_join_what_the_mesh_joins(kind):
-    depth = waves()
-    doubtful = np.zeros(depth.shape, bool)
-    doubtful[5:9, 30:50] = True
-    inverse, flags, _ = unpack(*pack_grid(grid(depth, doubtful=doubtful)))
-    np.testing.assert_array_equal(flags & 16 > 0, doubtful)
-    if kind == "certain":
-        inverse = np.where(doubtful, np.nan, inverse)
-        depth = np.where(doubtful, np.nan, depth)
-    found = faces_by(flags, inverse, *((1, 2) if kind == "certain" else (4, 8)))
-    expected = faces_of(depth)
-    assert len(expected) > 6000
-    assert found == expected
 
 
 def test_reduced_surface_is_cut_where_the_whole_one_is():

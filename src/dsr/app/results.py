@@ -21,7 +21,6 @@ from dsr.app.upsample.stored import (
     read_depth,
     read_errors,
     read_result,
-    read_up,
 )
 from dsr.geometry.mesh import fuse_maps, suggest_voxel
 from dsr.geometry.poses import PosedMap, as_rigid, check_poses
@@ -121,7 +120,7 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
     except ValueError as error:
         raise ValueError(f"{frames[0]}{' and others' if len(frames) > 1 else ''}: {error}") from error
     colours = _colours(mesh.vertices, frames, max_error, _SEEN * voxel, problems)
-    ups = {read_up(read_complete(folder)) for folder in frames}
+    ups = {read_complete(folder)["up"] for folder in frames}
     comment = world_comment(ups.pop() if len(ups) == 1 else "")
     write_ply(request.output, mesh.vertices, colours, mesh.normals, mesh.faces, frame=comment)
     size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, voxels of {show_length(voxel)}"

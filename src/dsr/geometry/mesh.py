@@ -97,7 +97,7 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
 def _faces(inverse: np.ndarray, allowed: np.ndarray | None) -> tuple[np.ndarray, int]:
     """Return the triangles of a map of inverse depth, (H, W), as (M, 3) indices, and how many there are of all."""
     height, width = inverse.shape
-    across, down = find_connections(inverse)
+    across, down = find_connections(inverse), find_connections(inverse.T).T
     top, bottom, left, right = across[:-1], across[1:], down[:, :-1], down[:, 1:]
     falling = np.abs(inverse[:-1, :-1] - inverse[1:, 1:])  # from the upper left pixel to the lower right one
     rising = np.abs(inverse[1:, :-1] - inverse[:-1, 1:])
@@ -114,16 +114,19 @@ def _faces(inverse: np.ndarray, allowed: np.ndarray | None) -> tuple[np.ndarray,
     kept, large = np.ones(first.shape, bool), np.empty((0, 3), np.int32)
     if allowed is not None:
         kept, large = _join(inverse, top & bottom & left & right, allowed)
-    small = [np.stack([corner[where & kept] for corner in corners], axis=1) for where, corners in choices]
-    return np.concatenate((*small, large)), sum(int(np.count_nonzero(where)) for where, _ in choices)
+    faces, dense = [], 0
+    for where, corners in choices:
+        dense += int(np.count_nonzero(where))
+        small = where & kept
+        faces.append(np.stack([corner[small] for corner in corners], axis=1))
+    return np.concatenate((*faces, large)), dense
 
 
 def _join(inverse: np.ndarray, whole: np.ndarray, tolerance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Join the pixels of inverse depth, (H, W) with NaN in holes, by triangles of up to 64 x 64 pixels.
+    """Join pixels by triangles of up to 64 x 64 pixels; return the squares that are left for two each, and the others.
 
-    ``whole``, (H - 1, W - 1), tells which squares of four pixels are one surface. Leaving out a pixel may change the
-    inverse depth there by ``tolerance``, (H, W), at each halving, NaN for not at all. Returns which squares are left
-    for two triangles each, and all other triangles, (M, 3) indices.
+    ``whole``, (H - 1, W - 1), are the squares of four pixels that are one surface. Leaving out a pixel may change the
+    inverse depth there by ``tolerance``, (H, W), at each halving, NaN for not at all.
     """
     height, width = whole.shape
     side = 1 << _LEVELS
@@ -200,13 +203,8 @@ def _leaves(needed: np.ndarray, rows: int, columns: int) -> tuple[np.ndarray, np
     return np.concatenate(done, axis=1).T, corners.T
 
 
-def find_connections(inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether each pixel of inverse depth, (H, W), is on one surface with its right and its lower neighbour."""
-    return _connected(inverse), _connected(inverse.T).T
-
-
-def _connected(inverse: np.ndarray) -> np.ndarray:
-    """Return whether each pixel and its right neighbour lie on one surface, (H, W - 1) bool; False beside holes."""
+def find_connections(inverse: np.ndarray) -> np.ndarray:
+    """Return whether each pixel of inverse depth, (H, W), is on one surface with its right neighbour, (H, W - 1)."""
     width, widest = inverse.shape[1], 2 * max(_HALF_WIDTHS)
     rows, found = max(1, _STRIP // width), []
     for start in range(0, len(inverse), rows):

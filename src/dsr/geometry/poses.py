@@ -8,7 +8,7 @@ informative the frames are.
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -166,11 +166,6 @@ def sample(count: int) -> list[tuple[int, ...]]:
     return sorted(group for group in groups if len(group) > 1)
 
 
-def check_poses(count: int, load: Callable[[int], PosedMap | None]) -> Assumption | None:
-    """Compare some frames of a sequence by :func:`find_fault`; ``load`` returns one, or None if it has no pose."""
-    return find_fault(filter(None, map(load, group)) for group in sample(count))
-
-
 class _Reduced(NamedTuple):
     """A reduced map, its camera, some points with their median depth, and the poses by all readings."""
 
@@ -211,9 +206,14 @@ def _compare(frame: _Reduced, other: _Reduced) -> tuple[np.ndarray, np.ndarray]:
     return count / max(z.shape[1], 1), agreeing.sum(1) / np.maximum(count, 1)
 
 
-def find_fault(groups: Iterable[Iterable[PosedMap]]) -> Assumption | None:
-    """Return a warning where frames of a group disagree under the poses as given; None if they show too little."""
-    pairs = [pair for group in groups for pair in itertools.combinations(map(_prepare, group), 2)]
+def check_poses(count: int, load: Callable[[int], PosedMap | None]) -> Assumption | None:
+    """Return a warning where frames disagree under the poses as given; None if they show too little.
+
+    Some frames of a sequence are compared; ``load`` returns one, or None if it has no pose.
+    """
+    pairs: list[tuple[_Reduced, _Reduced]] = []
+    for group in sample(count):
+        pairs += itertools.combinations([_prepare(each) for each in map(load, group) if each is not None], 2)
     # (pairs, readings + 1) each: under all readings and, last, without motion
     overlap, agreed = np.reshape([_compare(*pair) for pair in pairs], (len(pairs), 2, len(READINGS) + 1)).swapaxes(0, 1)
     with np.errstate(over="ignore", invalid="ignore"):  # distances of the two places as given, over the median depth

@@ -252,9 +252,10 @@ def _of_yaml(path: Path, text: str) -> CameraFile:
 
 def doubt_camera(camera: Camera, whose: str, size_lr: tuple[int, int] | None = None) -> list[Assumption]:
     """Return warnings of a camera, of the depth map's (height, width) if its intrinsics may have been given for it."""
-    found = (each for each in judge_camera(camera, size_lr) if each.level != "note")
     return [
-        Assumption(f"{whose}: {each.kind}", f"{each.message}; {each.advice}", each.code, each.value) for each in found
+        Assumption(f"{whose}: {each.kind}", f"{each.message}; {each.advice}", each.code, each.value)
+        for each in judge_camera(camera, size_lr)
+        if each.level != "note"
     ]
 
 

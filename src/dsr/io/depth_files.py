@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera, RangeType, from_range, to_range
-from dsr.io.images import expect_depth_values, read_array, read_numbers
+from dsr.io.images import read_numbers, read_values
 from dsr.notes import Assumption
 from dsr.sample import FARTHEST, NEAREST
 from dsr.utils.files import replacing
@@ -55,7 +55,7 @@ def read_depth_file(path: Path, most: int | None = None) -> np.ndarray:
         size = ICL_CAMERA.height, ICL_CAMERA.width
         values = read_numbers(path, size[0] * size[1]).reshape(size)
     else:
-        values = expect_depth_values(path, read_array(path, most))
+        values = read_values(path, most)
     if values.size == 0:
         raise ValueError(f"{path}: expected a depth map, got one of {values.shape[0]} x {values.shape[1]} pixels")
     return np.ascontiguousarray(values, values.dtype.newbyteorder("="))
@@ -154,13 +154,12 @@ def find_holes(
         name = f"{value:g}, far beyond all others (--hole-value 0 keeps them),"
         kinds[name] = values == value
         holes |= kinds[name]
-    found = {name: float(mask.mean()) for name, mask in kinds.items() if mask.any()}
-    assumptions = [
-        Assumption(
-            f"values that are {name} count as holes" if name != "0" else "zeros count as holes", f"{fraction:.1%}"
-        )
-        for name, fraction in found.items()
-    ]
+    found, assumptions = dict[str, float](), list[Assumption]()
+    for name, mask in kinds.items():
+        if mask.any():
+            found[name] = float(mask.mean())
+            text = "zeros count as holes" if name == "0" else f"values that are {name} count as holes"
+            assumptions.append(Assumption(text, f"{found[name]:.1%}"))
     if hole_value:
         return holes, hole_value, assumptions
     if values.dtype.kind in "iu":

@@ -77,15 +77,11 @@ def write_ply(
 
 
 class Written(NamedTuple):
-    """How much of a surface was written.
+    """How much of a surface was written."""
 
-    ``before`` and ``after``: triangles of the mesh, or points of the cloud, at full density and as written; ``how``:
-    what made them fewer, empty if nothing did; see :data:`FLAT`.
-    """
-
-    before: int
-    after: int
-    how: str = ""
+    before: int  # triangles of the mesh, or points of the cloud, at full density
+    after: int  # as written
+    how: str = ""  # what made them fewer, empty if nothing did; see FLAT
 
     def __str__(self) -> str:
         return f"{self.after} of {self.before}, by {self.how}"
@@ -104,6 +100,14 @@ def normal_strips(depth: Tensor, camera: Camera) -> Iterator[tuple[slice, Tensor
         part = depth[None, :, first:last].double()
         normals = depth_to_normals(part, camera.crop(first, 0, last - first, width).rays()[None], torch.float32)[0]
         yield slice(start, stop), normals[:, start - first : stop - first]
+
+
+def whole_normals(depth: Tensor, camera: Camera) -> Tensor:
+    """Return the normals of a map, (1, H, W), as (3, H, W) float32, NaN where unknown."""
+    normals = torch.empty((3, camera.height, camera.width))
+    for rows, part in normal_strips(depth, camera):
+        normals[:, rows] = part
+    return normals
 
 
 def write_renderings(folder: Path, depth: Tensor, camera: Camera) -> list[Path]:

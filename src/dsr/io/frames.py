@@ -18,6 +18,7 @@ from dsr.io.depth_files import DEPTH_SUFFIXES
 from dsr.io.images import Size, read_array
 from dsr.notes import Assumption
 from dsr.utils.guards import naming, pixels_beside
+from dsr.utils.versions import hash_once
 
 Record = dict[str, str | int]  # identifies an input in info.json: name, SHA-256, and a frame's number if it has one
 HIGHEST_LEVEL = 2  # of ARKit's confidence: 0 (low), 1 (medium) and 2 (high)
@@ -27,21 +28,23 @@ UPS = ("", "y", "z")  # axes of a capture's world that point up; "" where it doe
 _Arguments = ParamSpec("_Arguments")
 
 
+@dataclass(frozen=True)
 class Source:
     """A photo or a map inside a file: a frame of a video, a member of an archive, a message of a recording.
 
-    Kinds of sources are frozen dataclasses, which other processes read from the file anew.
+    Other processes get it pickled and read the file anew.
     """
 
     file: Path
+    name: str  # within the file
 
     def read(self) -> np.ndarray:
         """Return the pixels: (H, W, 3) uint8 RGB of a photo, (h, w) stored values of a map."""
         raise NotImplementedError
 
     def record(self) -> Record:
-        """Return what identifies the content."""
-        raise NotImplementedError
+        """Return what identifies the content: where it is, and a hash of the file."""
+        return {"file": f"{self.file.name}/{self.name}", "sha256": hash_once(self.file)}
 
 
 @dataclass(frozen=True)
@@ -51,8 +54,6 @@ class Part(Source):
     Both are functions of modules or partial ones, as other processes get them.
     """
 
-    file: Path
-    name: str
     fetch: Callable[[], bytes]
     decode: Callable[[bytes], np.ndarray]
 

@@ -75,8 +75,16 @@ def read_map(path: Path, most: int | None = None) -> np.ndarray:
 
 
 def read_values(path: Path, most: int | None = None) -> np.ndarray:
-    """Return a map in the type that it is stored in, (H, W); see :func:`read_map`."""
-    return expect_depth_values(path, read_array(path, most))
+    """Return a map in the type that it is stored in, (H, W), floats or whole numbers of 16 bits or more."""
+    values = read_array(path, most)
+    what = f": {_describe_picture(values)}" if values.dtype in (np.uint8, np.uint16) else ""
+    if values.ndim != 2:
+        raise ValueError(f"{path}: expected one channel (height x width), got shape {values.shape}{what}")
+    if values.dtype.kind not in "fiu" or (values.dtype.kind in "iu" and values.dtype.itemsize == 1):
+        raise ValueError(
+            f"{path}: expected 16-bit or floating point values, got {values.dtype} (too coarse for depth){what}"
+        )
+    return values
 
 
 def read_array(path: Path, most: int | None = None) -> np.ndarray:
@@ -87,18 +95,6 @@ def read_array(path: Path, most: int | None = None) -> np.ndarray:
     values = readers[path.suffix.lower()](path)
     if most is not None and values.ndim > 1:
         expect_pixels(path, values.shape[0], values.shape[1], most)
-    return values
-
-
-def expect_depth_values(path: Path, values: np.ndarray) -> np.ndarray:
-    """Return the values of a depth file if they are (H, W), floats or whole numbers of 16 bits or more."""
-    what = f": {_describe_picture(values)}" if values.dtype in (np.uint8, np.uint16) else ""
-    if values.ndim != 2:
-        raise ValueError(f"{path}: expected one channel (height x width), got shape {values.shape}{what}")
-    if values.dtype.kind not in "fiu" or (values.dtype.kind in "iu" and values.dtype.itemsize == 1):
-        raise ValueError(
-            f"{path}: expected 16-bit or floating point values, got {values.dtype} (too coarse for depth){what}"
-        )
     return values
 
 
@@ -151,11 +147,7 @@ def _content(path: Path) -> bytes:
 
 
 def _read_pfm(path: Path) -> np.ndarray:
-    """Return a PFM file's values as they are, (H, W).
-
-    The header's scale says the byte order by its sign; its magnitude, which OpenCV multiplies by, is left alone, as the
-    stereo benchmarks do.
-    """
+    """Return a PFM file's values, (H, W), not multiplied by the header's scale, as in the stereo benchmarks."""
     data = _content(path)
     header = re.match(rb"(P[Ff])\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]{1,40})(?:\r\n|\s)", data)
     if header is None:

@@ -51,10 +51,7 @@ _DOUBTED = 8  # about how many maps of a folder are asked whether what makes the
 
 
 class FolderUnits:
-    """The unit and range type of each kind of map from the first by name that has a known pixel.
-
-    The guess depends on all pairs of the folder alone, not on their order, nor on which were read or finished before.
-    """
+    """The unit and range type of each kind of map from the first by name that has a known pixel, whatever was read."""
 
     def __init__(self, pairs: Sequence[Pair] = ()) -> None:
         self._pairs = sorted(pairs, key=lambda pair: (natural_key(pair.depth.name), natural_key(pair.name)))
@@ -241,7 +238,7 @@ def _interpret(
     above = stored.shape[1] / meaning.unit if range_type == "disparity" else 0.0
     above = math.inf if reading.hole_value == 0 else above
     holes, mark, hole_notes = find_holes(stored, hole_value, above=above)
-    if range_type == "disparity" and reading.metres is None and meaning.unit == 1:
+    if range_type == "disparity" and reading.unit is None and meaning.unit == 1:
         expect_narrow(str(pair.depth), stored[~holes], camera)
     inside = pair.capture is not None and pair.capture.depth is not None
     suffix = ".npy" if inside or _is_icl(pair) else pair.depth.suffix.lower()  # the others cannot be written
@@ -430,9 +427,10 @@ def _unit(
     pair: Pair, reading: Reading, described: CameraFile, range_type: RangeType | None, stored: np.ndarray
 ) -> Meaning | None:
     """Return metres per value, or pixels per value of disparities, and the assumptions; None if nobody states them."""
-    if reading.metres is not None:
-        turned = reading.unit == "sunrgbd"
-        return Meaning(reading.metres, (Assumption(TURNED_BACK),) if turned else (), bits=SUNRGBD_BITS if turned else 0)
+    if reading.unit == "sunrgbd":
+        return Meaning(1e-3, (Assumption(TURNED_BACK),), bits=SUNRGBD_BITS)
+    if reading.unit is not None:
+        return Meaning(reading.unit, ())
     if range_type == "disparity":
         steps = " (whole numbers may be in steps of a pixel: --depth-unit 1/16)" if stored.dtype.kind in "iu" else ""
         return Meaning(1.0, (Assumption(f"disparities are read in pixels of the depth map{steps}"),))

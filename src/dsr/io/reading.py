@@ -83,11 +83,6 @@ class Reading(Options):
         if self.hole_value is not None and math.isnan(self.hole_value):
             object.__setattr__(self, "hole_value", None)
 
-    @property
-    def metres(self) -> float | None:
-        """Metres per value of the depth files; pixels per value of disparities."""
-        return _UNITS["sunrgbd"] if self.unit == "sunrgbd" else self.unit
-
 
 def parse_unit(text: str) -> float:
     """Return the metres per value that a text names: m, cm, mm, sunrgbd, a number, or a fraction such as 1/5000."""

@@ -22,7 +22,7 @@ _MOST_BETWEEN = 10.0  # metres between the two cameras of a rig; more is taken f
 NO_POSE = Assumption("no pose: the capture has none of the frame")
 USUAL_SIZE = (1440, 1920)  # height and width of iPhones' photos, for photos that were made smaller
 _OPEN3D_FILES = ("scene/trajectory.log", "trajectory.log")
-_ARKIT_TO_DSR = np.diag([1.0, -1.0, -1.0, 1.0])  # ARKit's and OpenGL's camera looks along -z with y up; dsr's along z
+ARKIT_TO_DSR = np.diag([1.0, -1.0, -1.0, 1.0])  # ARKit's and OpenGL's camera looks along -z with y up; dsr's along z
 
 
 @dataclass(frozen=True)
@@ -182,24 +182,15 @@ def _matrix_of_json(path: Path, text: str) -> list[list[float]]:
     return content
 
 
-def pose_from_quaternion(
-    source: str, quaternion: Sequence[float], position: Sequence[float], *, opengl: bool = False
-) -> np.ndarray:
-    """Return the pose (4, 4) from camera to world of a quaternion x, y, z, w and a position in metres.
-
-    ``source`` is the file and the place in it. ``opengl``: the camera's axes are x right, y up, z backward, as ARKit
-    and OpenGL have them, in place of x right, y down, z forward.
-    """
-    pose = from_quaternion(position, quaternion, source)
-    return pose @ _ARKIT_TO_DSR if opengl else pose
-
-
 def check_pose(source: str, matrix: np.ndarray, *, opengl: bool = False) -> np.ndarray:
-    """Return a rigid transform (4, 4) from camera to world as it is; see :func:`pose_from_quaternion`."""
+    """Return a rigid transform (4, 4) from camera to world as it is; ``source`` is the file and the place in it.
+
+    ``opengl``: the camera's axes are x right, y up, z backward, as ARKit and OpenGL have them.
+    """
     if matrix.shape != (4, 4):
         raise ValueError(f"{source}: expected a matrix of 4 x 4 numbers, got {' x '.join(map(str, matrix.shape))}")
     as_rigid(matrix, source)
-    return matrix @ _ARKIT_TO_DSR if opengl else matrix
+    return matrix @ ARKIT_TO_DSR if opengl else matrix
 
 
 def intrinsics_camera(source: str, size: tuple[int, int], numbers: Sequence[float]) -> Camera:

@@ -21,12 +21,9 @@ from PIL import Image
 from dsr.utils.files import replacing
 
 HOLE_COLOUR = "#d684b4"
-_DPI = 300
-"""Of figures that are written twice."""
-_PNG_LEVEL = 6
-"""Compression of PNG files."""
-_HEIGHT, _WIDTH, _GAP = 220, 320, 6
-"""Pixels: the panels' largest size, and what lies between them."""
+_DPI = 300  # of figures that are written twice
+_PNG_LEVEL = 6  # compression of PNG files
+_HEIGHT, _WIDTH, _GAP = 220, 320, 6  # pixels: the panels' largest size, and what lies between them
 _QUALITY = 85
 
 

@@ -13,18 +13,14 @@ from matplotlib.transforms import Bbox
 from dsr.pictures.canvas import Canvas, Part
 from dsr.pictures.depth_views import Window
 
-FRAMES = ("#ff8c00", "#00a5e3")
-"""Frame colours of the first and second detail."""
-_WIDTH, _LEAST_PANEL, _MOST_PANEL = 7.0, 0.95, 1.6
-"""Page width, inches, unless a panel would exceed its minimum or maximum width."""
-_TALLEST = 1.5
-"""Maximum ratio of height to width of a panel; taller pictures become narrower."""
+FRAMES = ("#ff8c00", "#00a5e3")  # colours, of the first and second detail
+_WIDTH, _LEAST_PANEL, _MOST_PANEL = 7.0, 0.95, 1.6  # inches, of the page unless a panel would exceed its limits
+_TALLEST = 1.5  # maximum ratio of height to width of a panel; taller pictures become narrower
 _GAP, _SEAM, _MARGIN, _LINE = 0.05, 0.04, 0.06, 0.125
 """Space between panels, between details and around the page, and height of a line of text, inches."""
 _BAR, _BAR_TEXT = 0.09, 0.42
 _FONT = 7.0
-_LETTER_WIDTH = 0.062
-"""Upper estimate of the width of a letter, inches."""
+_LETTER_WIDTH = 0.062  # upper estimate of the width of a letter, inches
 _EMPTY = "#f2f2f2"
 
 
@@ -90,10 +86,7 @@ def _wrap(text: str, length: float) -> str:
 
 
 class _Page(Canvas):
-    """A page of panels.
-
-    A picture's label is ``ROW: panel`` or ``ROW: detail``, as is that of the frame of an empty panel.
-    """
+    """A page of panels; a picture's label, and that of the frame of an empty panel, is ``ROW: panel``."""
 
     def text(self, x: float, y: float, text: str, **style: Any) -> None:
         """Write a text."""

@@ -15,13 +15,11 @@ from dsr.pictures.canvas import colours, save_both
 from dsr.pictures.depth_views import rendering
 from dsr.sample import DepthSample
 
-_SPHERE = 401
-"""Diameter of a sphere, pixels."""
+_SPHERE = 401  # diameter of a sphere, pixels
 _FONT = 8
 _PANEL, _GAP, _AXES, _ABOVE, _MARGIN = 1.42, 0.08, 0.95, 0.4, 0.06
 _ARROW = "#d1495b"
-_HALF_WIDTH = 1.32
-"""Half the width of a sphere's panel, in radii."""
+_HALF_WIDTH = 1.32  # half the width of a sphere's panel, in radii
 
 
 def save_lights_figure(folder: Path, scene: DepthSample | None = None) -> list[Path]:

@@ -15,7 +15,7 @@ from torch.nn import functional
 from dsr.geometry.camera import Camera
 from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.surface import render, render_for_viewing
-from dsr.io.exports import normal_strips
+from dsr.io.exports import whole_normals
 from dsr.metrics.formats import Formats, describe_directions, in_tables
 from dsr.pictures.canvas import Canvas, Panels, Part, with_holes, write_figure
 from dsr.pictures.depth_views import angles_between, limits_of, normals_seen_by, reduced, strongest_window
@@ -23,24 +23,17 @@ from dsr.sample import DepthSample
 from dsr.utils.ratios import round_ratio
 
 _DPI = 160
-_LONGEST = 1472
-"""Maximum longer side of a drawn map of errors, pixels: twice a panel."""
-_DEGREES = (1.0, 60.0)
-"""Limits of the colours of normals' errors."""
+_LONGEST = 1472  # maximum longer side of a drawn map of errors, pixels: twice a panel
+_DEGREES = (1.0, 60.0)  # limits of the colours of normals' errors
 _FEWEST_DPI, _MOST_DPI = 120, 200
 """Least and most pixels per inch; between them, a panel has 3 pixels for 4 of the picture."""
-_PANEL, _TALLEST, _NARROWEST = 3.78, 4.6, 2.2
-"""Maximum panel width, maximum panel height and minimum column width, inches."""
+_PANEL, _TALLEST, _NARROWEST = 3.78, 4.6, 2.2  # largest width and height of a panel, least of a column, inches
 _LEFT, _GAP, _HEADING, _BETWEEN, _BELOW = 0.3, 0.1, 0.92, 0.1, 0.62
 """Space left of the panels, between columns, above the first row, between rows and below the last row, inches."""
-_SIDE = 1536
-"""Maximum longer side of a drawn picture, pixels: twice the side of a panel."""
-_DETAIL = 4
-"""The detail is 1/4 of the picture wide and high."""
+_SIDE = 1536  # maximum longer side of a drawn picture, pixels: twice the side of a panel
+_DETAIL = 4  # the detail is 1/4 of the picture wide and high
 _FRAME = "#ff8c00"
 _ROWS = ("lit from above", "detail", "normals | depth")
-
-
 _WHOLE = Part(0, 1, 0, 1)
 
 
@@ -124,8 +117,8 @@ def write_before_after(path: Path, rgb: Tensor, depth_lr: Tensor, depth: Tensor,
     interpolation, and both by :func:`dsr.geometry.surface.render_for_viewing`. The detail is the window in which both
     renderings differ most. The PNG is at most 2400 pixels wide and written atomically.
     """
-    normals = _normals(depth, camera)
-    before = render_for_viewing(_normals(depth_lr, camera.rescale(depth_lr.shape[-1], depth_lr.shape[-2]))[None])[0]
+    normals, view = whole_normals(depth, camera), camera.rescale(depth_lr.shape[-1], depth_lr.shape[-2])
+    before = render_for_viewing(whole_normals(depth_lr, view)[None])[0]
     after = render_for_viewing(normals[None])[0]
     part = _detail(before, after)
     size, size_lr = (f"{each.shape[-1]} x {each.shape[-2]}" for each in (depth, depth_lr))
@@ -158,14 +151,6 @@ def write_before_after(path: Path, rgb: Tensor, depth_lr: Tensor, depth: Tensor,
         sheet.text(0.99 * sheet.figure.get_figwidth(), 0.3, "pink: holes", ha="right", va="center", fontsize=11)
     dpi = round(0.75 * max(camera.width, camera.height) / max(width, width * aspect))
     write_figure(path, sheet.figure, min(max(dpi, _FEWEST_DPI), _MOST_DPI))
-
-
-def _normals(depth: Tensor, camera: Camera) -> Tensor:
-    """Compute the normals of a depth map, (3, H, W) float32."""
-    normals = torch.empty((3, camera.height, camera.width))
-    for rows, part in normal_strips(depth, camera):
-        normals[:, rows] = part
-    return normals
 
 
 def _detail(before: Tensor, after: Tensor) -> Part:

@@ -23,12 +23,9 @@ from dsr.utils.ratios import round_ratio
 
 _ROWS = 6
 _DPI = 100
-_PANEL = 2.56
-"""Longer side of a panel, inches: 256 pixels."""
-_LONGEST = 512
-"""Maximum longer side of a picture, pixels."""
-_LEAST_PANEL = 0.3
-"""Minimum shorter side of a panel, inches."""
+_PANEL = 2.56  # longer side of a panel, inches: 256 pixels
+_LONGEST = 512  # maximum longer side of a picture, pixels
+_LEAST_PANEL = 0.3  # minimum shorter side of a panel, inches
 _TEXT, _MARGIN, _GAP, _ABOVE, _BELOW = 2.6, 0.15, 0.14, 0.8, 0.5
 """Width of the text column, margin, and space between panels, above the first row and below each row, inches."""
 _LEFT = tuple(_MARGIN + _TEXT + column * (_PANEL + _GAP) for column in range(4))
@@ -37,9 +34,7 @@ _SEAM, _LEAST_LABELLED = 0.04, 0.35
 """Space between the renderings, and minimum shorter side of a rendering with a label, inches."""
 _LABEL = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.2}
 _VALID_COLOUR = "#e4e4e4"
-_LETTERS = 27
-_LINE = 0.165
-"""Maximum letters of a line of text, and its height in inches."""
+_LETTERS, _LINE = 27, 0.165  # maximum letters of a line of text, and its height in inches
 
 
 @dataclass(frozen=True)

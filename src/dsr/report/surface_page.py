@@ -265,7 +265,7 @@ def find_joints(depth: np.ndarray, factor: int) -> Joints:
         rows = max(1, _STRIP // (lines.shape[1] * factor))
         for start in range(0, height, rows):
             stop = min(start + rows, height)
-            across, _ = find_connections(1 / lines[start * factor : stop * factor].astype(np.float64))
+            across = find_connections(1 / lines[start * factor : stop * factor].astype(np.float64))
             broken = np.pad(np.cumsum(~across, axis=1), ((0, 0), (1, 0)))  # number of cuts left of each pixel
             middles = factor // 2 + factor * np.arange(width)
             whole = broken[:, middles[1:]] == broken[:, middles[:-1]]

@@ -185,8 +185,8 @@ class Upsampler:
 
         """
         with python_messages():
-            picture = without_repeats(picture_of(rgb, depth, camera, mask=mask, unit=unit))
-            return self._upsample(picture, _device_of(depth), progress=progress)
+            picture, device = _read(rgb, depth, camera, mask=mask, unit=unit)
+            return self._upsample(picture, device, progress=progress)
 
     def stream(
         self, frames: Iterable[tuple[Any, ...]], *, neighbours: int = 4, unit: str | float | None = None
@@ -224,10 +224,7 @@ class Upsampler:
     def _stream(
         self, frames: Iterable[tuple[Any, ...]], neighbours: int, unit: str | float | None
     ) -> Iterator[Surface[Any]]:
-        """Yield surfaces; as many frames are kept as may vote on one.
-
-        A frame may be read ahead, for those before it; what is wrong with it is an error when its own turn comes.
-        """
+        """Yield surfaces; frames are read ahead for those before them, and their errors wait for their own turn."""
         source, place = enumerate(frames), 0
         kept: dict[int, tuple[Picture, torch.device | None] | ValueError] = {}
         views: dict[int, View] = {}  # of the frames that may vote
@@ -272,12 +269,9 @@ class Upsampler:
         *,
         look: bool = True,
     ) -> Surface[Any]:
-        """Return the surface of a picture on whose depth others vote; ``look`` whether photo and depth fit each other.
-
-        One without any measurement has holes, of which nothing is known.
-        """
+        """Return the surface of a picture on whose depth others vote; ``look`` whether photo and depth fit."""
         size, size_lr = size_of(picture.rgb), size_of(picture.depth_lr)
-        if _is_empty(picture):
+        if _is_empty(picture):  # then nothing is known of its holes
             holes = torch.full((1, *size), torch.nan)
             found = base.Surface(holes, holes, holes, filled=torch.zeros_like(holes, dtype=torch.bool))
             return Surface(picture, found, self._run.plan(size, size_lr), 0.0, device)
@@ -303,17 +297,18 @@ def _is_empty(picture: Picture) -> bool:
     return bool(picture.depth_lr.isnan().all())
 
 
-def _device_of(depth: Any) -> torch.device | None:
-    """Return the device of a depth map that was given as a tensor."""
-    return depth.device if isinstance(depth, Tensor) else None
+def _read(rgb: Any, depth: Any, camera: Any, **further: Any) -> tuple[Picture, torch.device | None]:
+    """Return a user's arguments as a picture, and the device of the depth map if that is a tensor."""
+    picture = picture_of(rgb, depth, camera, **further)
+    device = depth.device if isinstance(depth, Tensor) else None
+    return picture if _is_empty(picture) else without_repeats(picture), device
 
 
 def _read_frame(frame: Any, number: int, unit: str | float | None) -> tuple[Picture, torch.device | None]:
-    """Return a frame of a stream, and the device of its depth if that is a tensor."""
+    """Return a frame of a stream, see :func:`_read`."""
     with naming(f"frame {number}"), python_messages():
         if not isinstance(frame, tuple | list) or len(frame) not in (3, 4):
             came = f"{len(frame)} of them" if isinstance(frame, tuple | list) else type(frame).__name__
             raise ValueError(f"expected (rgb, depth, camera) or (rgb, depth, camera, pose), got {came}")
         rgb, depth, camera, pose = (*frame, None)[:4]
-        picture = picture_of(rgb, depth, camera, unit=unit, pose=pose, empty=True)
-        return picture if _is_empty(picture) else without_repeats(picture), _device_of(depth)
+        return _read(rgb, depth, camera, unit=unit, pose=pose, empty=True)

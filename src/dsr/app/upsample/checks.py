@@ -4,7 +4,7 @@ Photo and depth map are compared by their edges (:func:`align`); with ``--regist
 photo's. Warnings about a sample of the frames apply to all similar frames (:func:`check_together`).
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -47,10 +47,10 @@ def check_together(
     compared: list[tuple[Pair, Outlines, Outlines]] = []
     size: Size | None = None
     posed: set[Path] = set()
-    found: dict[str, list[Assumption]] = {pair.name: [] for pair in pairs}
+    found = defaultdict[str, list[Assumption]](list)
     sampled = {pair.name for pair in _sample(pairs)} if len(pairs) > 1 else set[str]()
     for group in alike(pairs):
-        bent: list[list[Assumption]] = []
+        asked, bent = 0, list[Assumption]()
         looked = [pair for pair in group if pair.name in sampled] or [group[len(group) // 2]]
         every = -(-len(looked) // _OF_PLANES)
         for number, pair in enumerate(looked):
@@ -59,7 +59,8 @@ def check_together(
             except (ValueError, OSError, MemoryError):
                 continue
             if number % every == 0:
-                bent.append(check_planes(picture, pair, reading))
+                asked += 1
+                bent += check_planes(picture, pair, reading)
             if picture.pose is not None:
                 posed.add(pair.depth.parent)
             if pair.name in sampled:
@@ -67,9 +68,9 @@ def check_together(
                 size = size or working_size(depth, picture.rgb)
                 photo = photo_outlines(reduce_photo(picture.rgb, size), max(size) / max(depth.shape))
                 compared.append((pair, depth_outlines(depth, size), photo))
-        votes = Counter(warning.code for each in bent for warning in each)
-        firsts = {warning.code: warning for each in reversed(bent) for warning in each}
-        common = [firsts[code] for code, count in votes.items() if 2 * count >= len(bent)]  # as the first one has it
+        votes = Counter(warning.code for warning in bent)
+        firsts = {warning.code: warning for warning in reversed(bent)}
+        common = [firsts[code] for code, count in votes.items() if 2 * count >= asked]
         for pair in group:
             found[pair.name] += common
     in_order = _check_order(compared)

@@ -15,17 +15,7 @@ from dsr.inference.working_size import enlarged_by, find_sensor
 from dsr.io.captures.colmap import add_model
 from dsr.io.inputs import FolderUnits, Picture
 from dsr.io.layouts import NoPairError, find_pairs_of_folder
-from dsr.io.pairs import (
-    Pair,
-    PairingResult,
-    Role,
-    add_confidence,
-    find_pairs_of_lists,
-    in_order,
-    role_of,
-    role_of_words,
-    words_of,
-)
+from dsr.io.pairs import Pair, PairingResult, add_confidence, find_pairs_of_lists, in_order
 from dsr.io.trajectories import read_poses
 from dsr.notes import LIMITS, Assumption
 
@@ -70,15 +60,9 @@ def _search(choice: FrameChoice, output: Path) -> PairingResult:
     try:
         parts = [find_pairs_of_folder(folder, output) for folder in choice.folders]
     except NoPairError as error:
-        places = choice.folders  # may be a folder of photos and one of depth maps, if their names say so
-        roles = {path: _role(path) for path in places if path.exists()}
-        rgb, depth = ([path for path, role in roles.items() if role == wanted] for wanted in ("rgb", "depth"))
-        if len(places) == 2 and len(rgb) == len(depth) == 1:
-            raise ValueError(
-                f"{places[0]} and {places[1]}: expected folders that hold both; photos and depth maps apart are given "
-                f"as --rgb {rgb[0]} --depth {depth[0]}"
-            ) from error
-        raise
+        if len(choice.folders) != 2:
+            raise
+        raise ValueError(f"{error}; photos and depth maps apart are given as --rgb PHOTOS --depth MAPS") from error
     if len(parts) == 1:
         return parts[0]
     pairs = [
@@ -90,15 +74,6 @@ def _search(choice: FrameChoice, output: Path) -> PairingResult:
         raise ValueError("expected folders of different names; give those of one name in commands of their own")
     facts = tuple(dict.fromkeys(fact for part in parts for fact in part.assumptions))
     return PairingResult(tuple(pairs), facts, tuple(path for part in parts for path in part.unpaired))
-
-
-def _role(path: Path) -> Role | None:
-    """Return the role that a folder's name says, or a file's, or that of its folder; None where they say nothing."""
-    path = path.resolve()
-    if not path.is_file():
-        return role_of_words(words_of(path.name))
-    role = role_of(path)  # "rgb" of a name that says nothing
-    return role_of_words(words_of(path.stem)) or _role(path.parent) if role == "rgb" else role
 
 
 class FrameSequence:

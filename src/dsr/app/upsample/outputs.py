@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from dsr.app.upsample.parts import ERRORS, FILES, METRES, PARTS, Results
 from dsr.app.upsample.stored import INFO, read_depth, read_errors, read_info
@@ -39,6 +38,7 @@ from dsr.notes import CHECKS, Assumption
 from dsr.utils.files import expect_targets, replacing, write_text
 from dsr.utils.versions import package_versions
 
+Values = Mapping[str, Any]  # for JSON
 _ERROR_STEPS = 2**6  # expected errors are stored with so many steps below each power of two: off by less than 2 %
 _WORTH_SAYING = 1e-3  # smallest fraction of the pixels that is reported as left out
 _PACKAGES = ("dsr", "torch", "numpy", "opencv-python-headless")
@@ -56,17 +56,13 @@ class Result:
 
     @functools.cached_property
     def encoding(self) -> Encoding:
-        """How the result is stored: as the input in the input's format, else in metres, or in whole millimetres.
-
-        It is :data:`dsr.io.depth_files.IN_METRES` itself where the input's values are such and no format is chosen. Of
-        whole numbers of 64 bits, which a TIFF may have and no writer writes, it has 32.
-        """
+        """How the result is stored: as the input in the input's format, else in metres, or in whole millimetres."""
         encoding, chosen = self.picture.encoding, self.wanted.format
         of_metres = replace(encoding, suffix=IN_METRES.suffix, hole=0.0) == replace(IN_METRES, hole=0.0)
         if chosen is None and of_metres and math.isnan(encoding.hole):
             return IN_METRES
         own = "tiff" if encoding.suffix == ".tif" else encoding.suffix[1:]
-        if chosen in (None, own):
+        if chosen in (None, own):  # whole numbers of 64 bits, which a TIFF may have and no writer writes, become 32
             return replace(encoding, dtype=str(storable(encoding.suffix, np.dtype(encoding.dtype))))
         if chosen in ("png", "mm"):
             return Encoding(".png", "uint16", 1e-3, 0.0, "orthogonal")
@@ -87,20 +83,16 @@ class Output(NamedTuple):
 
 
 class ResultFolder:
-    """The folder of a result, what the result depends on, as values for JSON, and the earlier run in it.
+    """The folder of a result, what the result depends on, and ``earlier``: the ``info.json`` of the run before."""
 
-    Attributes:
-        earlier: the ``info.json`` of the earlier run; empty without one.
-
-    """
-
-    def __init__(self, path: Path, inputs: Mapping[str, Any], settings: Mapping[str, Any], *, overwrite: bool) -> None:
-        self.path, self.inputs, self.settings, self.overwrite = path, inputs, settings, overwrite
+    def __init__(self, path: Path, inputs: Values, settings: Values, wanted: Results, *, strict: bool = False) -> None:
+        self.path, self.inputs, self.settings = path, inputs, settings
+        self._wanted, self._strict = wanted, strict
         self.look()
 
     def look(self) -> None:
-        """Read what an earlier run has left; a ValueError if that is not of `dsr upsample`."""
-        self.earlier: Mapping[str, Any] = read_info(self.path) or {}
+        """Read what an earlier run has left; a ValueError if that is not of ``dsr upsample``."""
+        self.earlier: Values = read_info(self.path) or {}
 
     @property
     def same(self) -> bool:
@@ -116,12 +108,12 @@ class ResultFolder:
     @property
     def reusable(self) -> bool:
         """Whether the earlier run is complete and had the same inputs and settings, and is to be kept."""
-        return self.same and self.earlier["complete"] and not self.overwrite
+        return self.same and self.earlier["complete"] and not self._wanted.overwrite
 
     def expect_agreement(self, cure: str = "take another -o, or --overwrite") -> None:
         """Raise ValueError, with a cure, if the folder holds a complete result of other inputs or settings."""
         earlier = self.earlier
-        if not earlier.get("complete") or self.same or self.overwrite:
+        if not earlier.get("complete") or self.same or self._wanted.overwrite:
             return
         if earlier["inputs"] != self.inputs:
             names = (str(entry.get("file", name)) for name, entry in earlier["inputs"].items())
@@ -140,21 +132,21 @@ class ResultFolder:
         for path in there:
             if any(path.samefile(source) for source in sources):
                 raise ValueError(f"{path}: the result would overwrite its input; take another -o")
-        if there and not self.earlier and not self.overwrite:
+        if there and not self.earlier and not self._wanted.overwrite:
             raise ValueError(f"{there[0]}: is there already and not of an earlier run; take another -o, or --overwrite")
 
-    def is_done(self, wanted: Results, *, checked: bool) -> bool:
-        """Return whether all requested parts exist as wanted, by a run that was ``checked`` as now if that counts.
-
-        A mesh of large triangles is none of every pixel; the other one serves for both.
-        """
-        if not self.reusable or (checked and self.earlier.get("checks") != CHECKS):
+    @property
+    def done(self) -> bool:
+        """Whether all requested parts exist as wanted, if ``strict`` by a run with the checks of today."""
+        if not self.reusable or (self._strict and self.earlier.get("checks") != CHECKS):
             return False
+        wanted = self._wanted
         there = {name for name in self.earlier["files"] if (self.path / name).is_file()}
         if METRES not in there and any(part.name == "depth" for part in wanted.of_frame):
             return False
         shapes = [self.earlier.get(part.name) for part in wanted.of_frame if part.shape]
-        if wanted.keep == "all" and any(isinstance(shape, dict) and shape.get("how") == FLAT for shape in shapes):
+        large = any(isinstance(shape, dict) and shape.get("how") == FLAT for shape in shapes)
+        if wanted.keep == "all" and large:  # which wants every pixel; a mesh of these serves for both
             return False
         return all(there & set(part.files) for part in wanted.of_frame)
 
@@ -184,9 +176,17 @@ class ResultFolder:
         depends_on = {"inputs": self.inputs, "settings": self.settings}
         self._write({"complete": False, **depends_on, "files": kept.get("files", [])})
         picture, surface = result.picture, result.surface
-        outputs = write_parts(self.path, result)
-        files = list(dict.fromkeys(name for output in outputs.values() for name in output.files))
-        facts = list(dict.fromkeys(note for output in outputs.values() for note in output.notes))
+        with ThreadPoolExecutor(1) as beside:  # shapes take as long as all the rest
+            shapes = beside.submit(_write_shapes, self.path, result)
+            written = _write_maps(self.path, result) | shapes.result()
+        files: dict[str, None] = {}  # each once, as the notes
+        facts: dict[Assumption, None] = {}
+        counts: dict[str, dict[str, Any]] = {}
+        for name, output in written.items():
+            files |= dict.fromkeys(output.files)
+            facts |= dict.fromkeys(output.notes)
+            if output.shape is not None:
+                counts[name] = output.shape._asdict()
         others = [name for name in kept.get("files", ()) if name not in files]
         notes = (*picture.assumptions, *facts)
         known = ("warning: ", *(note.text for note in notes))
@@ -194,12 +194,11 @@ class ResultFolder:
         before = kept["seconds"] if reused else {}
         stages = {**seconds, "writing": time.perf_counter() - started}
         stages = {name: round(before.get(name, 0.0) + each, 3) for name, each in stages.items()}
-        counts = {name: output.shape._asdict() for name, output in outputs.items() if output.shape is not None}
         if surface.outliers is not None:
             counts["outliers"] = surface.outliers._asdict()
         self._write(
             {
-                **{name: each for name, each in kept.items() if name not in outputs},
+                **{name: each for name, each in kept.items() if name not in written},
                 "complete": True,
                 **depends_on,
                 "method": result.plan.method,
@@ -220,7 +219,7 @@ class ResultFolder:
                 "files": [*files, *others],
             }
         )
-        return facts
+        return list(facts)
 
     def _write(self, info: dict[str, Any]) -> None:
         """Write ``info.json``."""
@@ -230,11 +229,11 @@ class ResultFolder:
 
 def _described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
     """Return the sizes, the camera with its pose, and the files' encodings for ``info.json``."""
-
-    def plain(encoding: Encoding) -> dict[str, Any]:
-        entries = asdict(encoding)
-        return entries if math.isfinite(encoding.hole) else {**entries, "hole": str(encoding.hole)}  # JSON has no NaN
-
+    encodings = {"input_depth": picture.encoding, "depth_file": encoding, "depth_metres": IN_METRES}
+    plain = {name: asdict(each) for name, each in encodings.items()}
+    for entries in plain.values():
+        if not math.isfinite(entries["hole"]):  # which JSON has not
+            entries["hole"] = str(entries["hole"])
     return {
         "photo_size": [picture.camera.width, picture.camera.height],
         "input_size": [picture.depth_lr.shape[-1], picture.depth_lr.shape[-2]],
@@ -243,31 +242,21 @@ def _described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
         "pose": None if picture.pose is None else picture.pose.tolist(),
         "up": picture.up,
         "time": picture.time,
-        "input_depth": plain(picture.encoding),
-        "depth_file": plain(encoding),
-        "depth_metres": {"file": METRES, **plain(IN_METRES)},
+        **plain,
+        "depth_metres": {"file": METRES, **plain["depth_metres"]},
     }
 
 
 def as_stored(surface: Surface) -> Surface:
     """Return a surface with expected errors that are stored to the bit, so that parts added later are the same."""
-    rounded: dict[str, Tensor] = {}
+    rounded: dict[str, Any] = {}
     for name, values in (("depth_error", surface.depth_error), ("angle_error", surface.angle_error)):
         if values is not None:
             mantissa, exponent = torch.frexp(values.float())
             rounded[name] = torch.ldexp((_ERROR_STEPS * mantissa).round() / _ERROR_STEPS, exponent)
-    rough = surface._replace(depth_error=rounded.get("depth_error"), angle_error=rounded.get("angle_error"))
-    stored = {name: torch.from_numpy(values)[None].float() for name, values in rough.error_arrays().items()}
-    return surface._replace(depth_error=stored.get("depth_error"), angle_error=stored.get("angle_error"))
-
-
-def write_parts(folder: Path, result: Result) -> dict[str, Output]:
-    """Write the parts of a frame's result into its folder, and return what each has written, by name."""
-    with ThreadPoolExecutor(1) as beside:  # shapes take as long as all the rest
-        shapes = beside.submit(_write_shapes, folder, result)
-        written = _write_maps(folder, result)
-        written |= shapes.result()
-    return {part.name: written[part.name] for part in result.wanted.of_frame}
+    for name, stored in surface._replace(**rounded).error_arrays().items():
+        rounded[name] = torch.from_numpy(stored)[None].float()
+    return surface._replace(**rounded)
 
 
 def _write_maps(folder: Path, result: Result) -> dict[str, Output]:

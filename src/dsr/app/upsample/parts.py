@@ -4,7 +4,7 @@ import functools
 import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from dsr.geometry.lights import LIGHT_NAMES
 from dsr.utils.guards import MOST_FACES, MOST_POINTS
@@ -33,6 +33,7 @@ class Part(NamedTuple):
     library: tuple[str, str, str] | None = None  # module that it needs, its package, and the extra that installs it
 
 
+# by their names, in the order in which they are listed
 PARTS: dict[str, Part] = {
     part.name: part
     for part in (
@@ -54,16 +55,17 @@ PARTS: dict[str, Part] = {
              library=("rerun", "rerun-sdk", "rerun")),
     )
 }  # fmt: skip
-"""All parts by their names, in the order in which they are listed."""
 _MORE = tuple(part.name for part in PARTS.values() if not part.usual)
+# all files that may be in the folder of a picture's results beside info.json
 FILES = tuple(name for part in PARTS.values() if not part.of_all for name in part.files)
-"""All files that may be in the folder of a picture's results beside ``info.json``."""
 EXPECTED_ERROR = Rule("a positive percentage of the depth", lambda percent: percent > 0)
-
-
-def _words(text: str) -> tuple[str, ...]:
-    """Return the words between commas."""
-    return tuple(word.strip() for word in text.split(",") if word.strip())
+# what the options of names of parts have in common
+_NAMES: dict[str, Any] = {
+    "metavar": "PARTS",
+    "parse": lambda text: tuple(word.strip() for word in text.split(",") if word.strip()),
+    "rule": Rule(f"some of {', '.join(PARTS)}", PARTS.__contains__, each=True, known=PARTS),
+    "recorded": False,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,13 +79,9 @@ class Results(Options):
         "FORMAT",
         rule=one_of(FORMATS),
     )
-    only: tuple[str, ...] | None = option(
-        None, f"some of {','.join(PARTS)}", "PARTS", parse=_words, alone="parts", recorded=False
-    )
-    without: tuple[str, ...] = option((), "all but these", "PARTS", parse=_words, alone="parts", recorded=False)
-    more: tuple[str, ...] = option(
-        (), f"also these: {','.join(_MORE)}; see docs/results.md", "PARTS", flags="--with", parse=_words, recorded=False
-    )
+    only: tuple[str, ...] | None = option(None, f"some of {','.join(PARTS)}", alone="parts", **_NAMES)
+    without: tuple[str, ...] = option((), "all but these", alone="parts", **_NAMES)
+    more: tuple[str, ...] = option((), f"also these: {','.join(_MORE)}; see docs/results.md", flags="--with", **_NAMES)
     keep: Literal["usual", "all"] = option(
         "usual", "all: also mesh.ply and cloud.ply, and a mesh of every pixel, ten times the size", recorded=False
     )
@@ -123,10 +121,6 @@ class Results(Options):
     def __post_init__(self) -> None:
         """Check the values, and that there is something to write."""
         super().__post_init__()
-        for name in (*(self.only or ()), *self.without, *self.more):
-            if name not in PARTS:
-                known = ", ".join(PARTS)
-                raise ValueError(f"--only, --with, --without: expected some of {known}, got {name!r}")
         if not self.names:
             raise ValueError("--only, --without: expected something to be left to write, got nothing")
         for part in self.of_all:

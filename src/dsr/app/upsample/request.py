@@ -41,13 +41,6 @@ def _parse_settings(texts: list[str]) -> tuple[tuple[str, Any], ...]:
     return tuple(settings.items())
 
 
-def _parse_poses(text: str) -> Path:
-    """Return the file of poses; of a folder with a model of COLMAP that of its images."""
-    from dsr.io.captures.colmap import model_file  # noqa: PLC0415 - few commands have poses
-
-    return model_file(Path(text)) or Path(text)
-
-
 @dataclass(frozen=True, kw_only=True)
 class FrameChoice(Options):
     """Which frames to work on, and how many at a time."""
@@ -76,7 +69,6 @@ class FrameChoice(Options):
         None,
         "camera poses: TUM's format, 4 x 4 matrices, or a model of COLMAP with its cameras",
         "FILE",
-        parse=_parse_poses,
         recorded=False,
     )
     workers: int = option(
@@ -93,7 +85,7 @@ class FrameChoice(Options):
         if self.poses is not None and len(self.folders) > 1:
             raise OptionError("poses", f"expected the frames of one folder, got {len(self.folders)} folders")
 
-    @property
+    @functools.cached_property
     def model(self) -> Path | None:
         """The images of a model of COLMAP, whose poses, cameras and lenses the frames have; or None."""
         from dsr.io.captures.colmap import model_file  # noqa: PLC0415 - few commands have poses
@@ -164,7 +156,7 @@ class Upsampling(Options):
             if name in SHORTCUTS and getattr(self, name) is not None:
                 raise OptionError(name, f"expected it once, got --set {name}={value}, too")
 
-    @property
+    @functools.cached_property
     def arguments(self) -> dict[str, Any]:
         """Arguments of the method that are given."""
         given = {name: getattr(self, name) for name in SHORTCUTS}
@@ -173,7 +165,7 @@ class Upsampling(Options):
     def check_slowly(self) -> None:
         """Run the checks that take seconds: that the method accepts its arguments, and the name of the sensor."""
         if self.arguments or self.size != "auto":
-            run = replace(self, device="cpu").upsampler()
+            run = replace(self, device="cpu").upsampler
             try:
                 run.check_working_size()
                 run.first()
@@ -190,8 +182,9 @@ class Upsampling(Options):
             except ValueError as error:
                 raise ValueError(f"--{error}") from error
 
+    @functools.cached_property
     def upsampler(self) -> AnyRatio:
-        """Return the method, which loads its weights once; a ValueError if there is no such device."""
+        """The method, which loads its weights once; a ValueError if there is no such device."""
         from dsr.inference.any_ratio import upsampler  # noqa: PLC0415 - other values are refused without torch
 
         return upsampler(
@@ -245,13 +238,8 @@ class UpsampleRequest(Options):
         }
 
 
-def files_of(pair: Pair, reading: Reading) -> dict[str, Path]:
-    """Return the files that a result depends on."""
-    return {name: each if isinstance(each, Path) else each.file for name, each in _inputs(pair, reading).items()}
-
-
-def _inputs(pair: Pair, reading: Reading) -> dict[str, Path | Source]:
-    """Return the inputs: files, or in captures what is no file of its own."""
+def inputs_of(pair: Pair, reading: Reading) -> dict[str, Path | Source]:
+    """Return what a result depends on: files, or in captures what is no file of its own."""
     given = reading.camera.fov is not None or reading.camera.intrinsics is not None
     camera = reading.camera.file or (None if given else pair.camera)
     found: dict[str, Path | Source | None] = {"rgb": pair.rgb, "depth": pair.depth, "camera": camera, "mask": pair.mask}
@@ -265,9 +253,9 @@ def _inputs(pair: Pair, reading: Reading) -> dict[str, Path | Source]:
     return {name: each for name, each in found.items() if each is not None}
 
 
-def _inputs_of(pair: Pair, reading: Reading) -> dict[str, Record]:
+def _record_of(pair: Pair, reading: Reading) -> dict[str, Record]:
     inputs: dict[str, Record] = {}
-    for name, each in _inputs(pair, reading).items():
+    for name, each in inputs_of(pair, reading).items():
         if not isinstance(each, Path):
             inputs[name] = each.record()
         elif each.is_file():
@@ -279,10 +267,11 @@ def _inputs_of(pair: Pair, reading: Reading) -> dict[str, Record]:
 
 def inputs_with_neighbours(request: UpsampleRequest, pair: Pair, neighbours: Sequence[Pair]) -> dict[str, Record]:
     """Return the inputs of a frame, its neighbours and its pose, and their hashes, as values for JSON."""
-    inputs = _inputs_of(pair, request.reading)
+    inputs = _record_of(pair, request.reading)
     for number, other in enumerate(neighbours, 1):
-        inputs |= {f"neighbour_{number}_{name}": each for name, each in _inputs_of(other, request.reading).items()
+        inputs |= {f"neighbour_{number}_{name}": each for name, each in _record_of(other, request.reading).items()
                    if name not in ("rgb", "depth_camera", "extrinsics")}  # fmt: skip
-    if request.frames.poses is not None:
-        inputs["poses"] = {"file": request.frames.poses.name, "sha256": file_hash(request.frames.poses)}
+    poses = request.frames.model or request.frames.poses
+    if poses is not None:
+        inputs["poses"] = {"file": poses.name, "sha256": file_hash(poses)}
     return inputs

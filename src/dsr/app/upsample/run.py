@@ -11,16 +11,15 @@ from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rich.console import Console
 
 from dsr.app.upsample.checks import align, check_together
 from dsr.app.upsample.frames import Frames, FrameSequence, find_frames, prepare, without_repeats
 from dsr.app.upsample.outputs import Result, ResultFolder, as_stored
-from dsr.app.upsample.request import UpsampleRequest, Upsampling, files_of, inputs_with_neighbours
+from dsr.app.upsample.request import UpsampleRequest, Upsampling, inputs_of, inputs_with_neighbours
 from dsr.app.upsample.stored import EXPORTS, INFO, warnings_of, write_scene
-from dsr.inference.any_ratio import AnyRatio
 from dsr.inference.plausibility import find_filled
 from dsr.inference.resizing import size_of
 from dsr.io.images import pixels_in_header
@@ -65,7 +64,7 @@ class Reporter:
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._notes: dict[str, list[Assumption]] = {}  # of the frames, by their statement
+        self.notes: dict[str, list[Assumption]] = {}  # of the frames, by their statement
 
     def tell(self, message: Message) -> None:
         """Show a line, or the notes that no earlier frame had."""
@@ -73,17 +72,13 @@ class Reporter:
             show(self._console, message)
             return
         for note in message:
-            if note.statement not in self._notes:
+            if note.statement not in self.notes:
                 show(self._console, f"  {note}")
-            self._notes.setdefault(note.statement, []).append(note)
-
-    def warnings(self) -> list[dict[str, Any]]:
-        """Return the warnings as values for JSON, each once, as of the first of so many ``pictures``."""
-        return [{**notes[0].record(), "pictures": len(notes)} for notes in self._notes.values() if notes[0].code]
+            self.notes.setdefault(note.statement, []).append(note)
 
     def summary(self, pictures: int) -> None:
         """Show the notes that apply to some of the pictures only."""
-        for text, notes in self._notes.items():
+        for text, notes in self.notes.items():
             if len(notes) < pictures:
                 show(self._console, f"  {len(notes)} of {pictures} pictures: {text}")
 
@@ -135,11 +130,12 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
         pictures = "1 picture" if len(pairs) == 1 else f"{len(pairs)} pictures"
         show(console, f"{pictures}: {', '.join(counts) or 'nothing to do'}{took} -> {wanted.output}")
     if shard is not None and not wanted.dry_run:
+        warnings = [(notes[0].record(), len(notes)) for notes in reporter.notes.values() if notes[0].code]
         summary = {
             "shard": str(shard),
             "outcomes": outcomes,
             "failed": [{"problem": problem, "frames": names} for problem, names in problems.items()],
-            "warnings": reporter.warnings(),
+            "warnings": [{**warning, "pictures": count} for warning, count in warnings],
             "seconds": round(time.monotonic() - started, 3),
         }
         write_text(wanted.output / written[0], json.dumps(summary, indent=2) + "\n")
@@ -147,10 +143,7 @@ def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str
 
 
 def work_through(request: UpsampleRequest, frames: Frames, tell: Tell, progress: Progress) -> Iterator[Done]:
-    """Upsample frames in ``--workers`` processes, each with its share of the cores; yield each once it is done.
-
-    Notes are shown in the order of the frames, or as they come from several workers.
-    """
+    """Upsample frames in ``--workers`` processes, each with its share of the cores; yield each once it is done."""
     output = request.results.output  # the folder of a single frame; no link leads those of several out of it
     jobs = [(pair, output if frames.single else path_within(output, pair.name, output)) for pair in frames.found.pairs]
     workers = min(request.frames.workers, len(jobs))
@@ -237,10 +230,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 class FrameWork:
-    """Upsamples the frames of a request, one at a time; those of other shards are neighbours and determine units.
-
-    Of the photos that were read last so many numbers are ``kept`` for their own turn, or as neighbours.
-    """
+    """Upsamples the frames of a request, one at a time; those of other shards are neighbours and determine units."""
 
     def __init__(self, request: UpsampleRequest, frames: Frames, kept: int = _KEPT) -> None:
         self._request, self._frames, self._kept = request, frames, kept
@@ -252,7 +242,7 @@ class FrameWork:
         for pair, target in jobs:
             done = False  # also if it cannot be read, which is reported when its turn comes
             with contextlib.suppress(ValueError, OSError):
-                done = (target / INFO).is_file() and self._is_done(self._folder(pair, target))
+                done = (target / INFO).is_file() and self._folder(pair, target).done
             if not done:
                 warnings = check_together(self._frames.whole, self._request.reading, self._read, self._sequence)
                 self._frames = replace(self._frames, warnings=warnings)
@@ -265,7 +255,7 @@ class FrameWork:
         try:
             with refusing_excess(), contextlib.ExitStack() as stack:
                 folder = self._folder(pair, target)
-                if not wanted.dry_run and not self._is_done(folder):
+                if not wanted.dry_run and not folder.done:
                     stack.enter_context(scene_lock(wanted.output, str(target.relative_to(wanted.output))))
                     folder.look()  # another command may have been at work there
                 return self._work(pair, folder, tell, progress)
@@ -276,7 +266,7 @@ class FrameWork:
         """Upsample a frame that no other command is at."""
         request, wanted, how = self._request, self._request.results, self._request.upsampling
         folder.expect_agreement()
-        if self._is_done(folder):
+        if folder.done:
             warnings = warnings_of(folder.earlier)
             self._expect_no_warning(pair, folder, warnings)
             tell(warnings)
@@ -287,18 +277,19 @@ class FrameWork:
         picture = replace(picture, assumptions=(*picture.assumptions, *self._frames.warnings.get(pair.name, ())))
         picture, sensor = prepare(picture, how.sensor, functools.partial(self._sequence.fuse, pair))
         picture = align(picture, register=request.reading.register)
-        planned = self._upsampler.plan(size_of(picture.rgb), size_of(picture.depth_lr))
+        planned = how.upsampler.plan(size_of(picture.rgb), size_of(picture.depth_lr))
         self._expect_no_warning(pair, folder, picture.assumptions)
         tell(picture.assumptions)
         if wanted.dry_run:
             tell(f"{pair.name}: {planned.text} -> {folder.path}")
             return Done(pair, folder.path, "to do")
-        folder.expect_free(files_of(pair, request.reading).values())
+        sources = inputs_of(pair, request.reading).values()
+        folder.expect_free(each if isinstance(each, Path) else each.file for each in sources)
         read = time.perf_counter()
         kept = folder.surface(picture.camera, errors=any(part.errors for part in wanted.of_frame))
         if kept is None:
             with progress.task("steps") as step:
-                surface = self._upsampler.upsample(picture.rgb, picture.depth_lr, picture.camera, step, sensor)
+                surface = how.upsampler.upsample(picture.rgb, picture.depth_lr, picture.camera, step, sensor)
             surface = as_stored(surface)
             tell(_describe(surface, how))
             surface = surface.without_dubious(wanted.max_error / 100) if wanted.certain else surface
@@ -314,22 +305,15 @@ class FrameWork:
 
     def _folder(self, pair: Pair, target: Path) -> ResultFolder:
         """Return the folder of a frame's results, with what these depend on."""
-        inputs = inputs_with_neighbours(self._request, pair, self._sequence.neighbours(pair))
-        return ResultFolder(target, inputs, self._request.settings, overwrite=self._request.results.overwrite)
-
-    def _is_done(self, folder: ResultFolder) -> bool:
-        return folder.is_done(self._request.results, checked=self._request.reading.strict)
+        request = self._request
+        inputs = inputs_with_neighbours(request, pair, self._sequence.neighbours(pair))
+        return ResultFolder(target, inputs, request.settings, request.results, strict=request.reading.strict)
 
     def _expect_no_warning(self, pair: Pair, folder: ResultFolder, notes: Sequence[Assumption]) -> None:
         """Raise ValueError if one is a warning, and that is not allowed; with one line for all frames of a folder."""
         if self._request.reading.strict:
             several = folder.path != self._request.results.output
             expect_no_warning(str(pair.depth.parent if several else pair.depth), notes, brief=several)
-
-    @functools.cached_property
-    def _upsampler(self) -> AnyRatio:
-        """The method, whose weights are loaded once."""
-        return self._request.upsampling.upsampler()
 
     def _read(self, pair: Pair) -> Picture:
         """Return a frame as it was read; the last ones are kept."""
@@ -367,10 +351,7 @@ def _describe(surface: Surface, how: Upsampling) -> list[Assumption]:
 
 
 def _in_brief(noise: MapNoise | None, shares: Mapping[str, float]) -> list[str]:
-    """Return the noise of the input, the size that it was worked on at, and the shares of the pixels that are not 0.
-
-    A share is 0 % or 100 % only if it is exactly that.
-    """
+    """Return the noise of the input, the size that it was worked on at, and the shares of the pixels that are not 0."""
     brief = []
     if noise is not None:
         brief.append(f"noise {show_length(noise.deviation, 2)}")
@@ -378,7 +359,7 @@ def _in_brief(noise: MapNoise | None, shares: Mapping[str, float]) -> list[str]:
             brief.append(f"worked on at 1/{noise.reduced}")
     words = {"open": "left open", "glass": "like glass"}
     for name, share in shares.items():
-        if share:
+        if share:  # 0 % and 100 % are exactly that
             percent = f"{min(max(round(100 * share, 1), 0.1), 99.9):g}%" if share < 1 else f"{share:.0%}"
             brief.append(f"{words.get(name, name)} {percent}")
     return brief

@@ -125,7 +125,8 @@ def read_info(folder: Path) -> dict[str, Any] | None:
         if not all(map(is_number, (*info["shares"].values(), *info["seconds"].values()))):
             raise TypeError
         warnings_of(info)
-        return {**info, "complete": info["complete"] is True}
+        up = info.get("up")
+        return {**info, "complete": info["complete"] is True, "up": up if up in UPS else ""}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else") from error
 
@@ -143,12 +144,6 @@ def read_complete(folder: Path) -> dict[str, Any]:
     if not info["complete"]:
         raise ValueError(f"{folder / INFO}: expected a complete result, got that of an interrupted run; run it again")
     return info
-
-
-def read_up(info: Mapping[str, Any]) -> str:
-    """Return the axis of the world that points up, one of :data:`dsr.io.frames.UPS`."""
-    up = info.get("up")
-    return up if isinstance(up, str) and up in UPS else ""
 
 
 def read_camera(folder: Path, info: Mapping[str, Any]) -> Camera:
@@ -191,11 +186,10 @@ def read_errors(folder: Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     path = folder / ERRORS
     size = (camera.height, camera.width)
     shapes = {name: shape for name, (shape, _) in array_headers(path).items()}
-    if any(shapes.get(name) != size for name in ("depth_error", "angle_error")):
-        raise ValueError(f"{path}: expected depth_error and angle_error of shape {size}, the photo's, got {shapes}")
-    errors = load_errors(path)
+    fits = all(shapes.get(name) == size for name in ("depth_error", "angle_error"))
+    errors = load_errors(path) if fits else None
     if errors is None:
-        raise ValueError(f"{path}: expected depth_error and angle_error, got {shapes}")
+        raise ValueError(f"{path}: expected depth_error and angle_error of shape {size}, the photo's, got {shapes}")
     return errors[0][0].numpy(), errors[1][0].numpy()
 
 
@@ -209,7 +203,7 @@ def read_frame(name: str, folder: Path) -> Frame:
     if not (depth.is_file() and colour.is_file()):
         raise ValueError(f"{folder}: expected {METRES} and rgbd/{RGBD[0]} of this run, one is missing")
     pose, time = parse_pose(f"{folder / INFO}: pose", info.get("pose")), info.get("time")
-    return Frame(name, read_camera(folder, info), pose, colour, depth, read_up(info), time if is_number(time) else None)
+    return Frame(name, read_camera(folder, info), pose, colour, depth, info["up"], time if is_number(time) else None)
 
 
 def write_scene(

@@ -22,7 +22,7 @@ from dsr.geometry.lights import FIGURE_LIGHT, Direction, direction_of
 from dsr.geometry.mesh import Mesh, triangulate, vertex_normals
 from dsr.geometry.surface import render_for_viewing, shade
 from dsr.inference.resizing import Plan
-from dsr.io.exports import as_bytes, normal_strips
+from dsr.io.exports import as_bytes, whole_normals
 from dsr.io.files import python_messages
 from dsr.io.inputs import Picture
 from dsr.io.photos import data_url
@@ -32,8 +32,8 @@ from dsr.notes import warn
 from dsr.pictures.canvas import encode_row
 
 Array = TypeVar("Array", np.ndarray, Tensor)
+# of `dsr upsample`, which Surface.save takes
 _OPTIONS = ("format", "max_error", "certain", "max_faces", "max_points", "keep", "overwrite")
-"""What :meth:`Surface.save` takes of the options of ``dsr upsample``."""
 
 
 class Points(NamedTuple):
@@ -213,7 +213,7 @@ class Surface(Generic[Array]):
             content = hashlib.sha256(self._found.depth.numpy().tobytes() + as_bytes(self._picture.rgb).tobytes())
             inputs = {"surface": {"sha256": content.hexdigest()}}  # which a folder of results has for its inputs
             path, limit = wanted.output, wanted.max_error / 100
-            results = ResultFolder(path, inputs, {"max_error": limit}, overwrite=wanted.overwrite)
+            results = ResultFolder(path, inputs, {"max_error": limit}, wanted)
             results.expect_agreement("take another folder, or overwrite=True")
             results.expect_free()
             found = self._found.without_dubious(limit) if wanted.certain else self._found
@@ -240,9 +240,8 @@ class Surface(Generic[Array]):
         """Return the photo, the depth map that was given, and the surface, both under a light, for a notebook."""
         before = self._picture.depth_lr
         view = self.camera.rescale(before.shape[-1], before.shape[-2])
-        tones: list[np.ndarray] = [
-            render_for_viewing(each[None])[0, 0].numpy() for each in (_normals(before, view), self._normals)
-        ]
+        normals = whole_normals(before, view), self._normals
+        tones: list[np.ndarray] = [render_for_viewing(each[None])[0, 0].numpy() for each in normals]
         content = encode_row([self._picture.rgb.permute(1, 2, 0).numpy(), *tones])
         error = float(self._found.depth_error.nanmedian()) if self._found.depth_error is not None else float("nan")
         size = f"{self.camera.width} x {self.camera.height}"
@@ -260,7 +259,7 @@ class Surface(Generic[Array]):
     @functools.cached_property
     def _normals(self) -> Tensor:
         """The normals, (3, H, W)."""
-        return _normals(self._found.depth, self.camera)
+        return whole_normals(self._found.depth, self.camera)
 
     def _certain(self, max_error: float | None) -> Tensor:
         """Return the depth, (1, H, W), without pixels that are likely to be wrong."""
@@ -279,8 +278,3 @@ class Surface(Generic[Array]):
         """Return a map, (1, H, W), as the depth map was given."""
         assert values is not None  # noqa: S101 - AnyRatio estimates what a method does not say
         return cast("Array", values[0].numpy().copy() if self._device is None else values.to(self._device, copy=True))
-
-
-def _normals(depth: Tensor, camera: Camera) -> Tensor:
-    """Return the normals of a depth map, (3, H, W) float32."""
-    return torch.cat([part for _, part in normal_strips(depth, camera)], dim=1)

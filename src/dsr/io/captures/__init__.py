@@ -6,6 +6,7 @@ Other packages add readers by an entry point of the group ``dsr.captures`` that 
 
 from __future__ import annotations
 
+import re
 from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -204,7 +205,7 @@ CAPTURES = (
         "https://github.com/microsoft/Azure-Kinect-Sensor-SDK/tree/develop/src/record",
         of_file=partial(_call, "kinect.read"),
         suffixes=(".mkv",),
-        is_ours=partial(_call, "kinect.is_ours"),
+        mark=re.compile(rb"K4A_DEPTH_MODE"),
     ),
     Capture(
         "HEIC photos with depth",
@@ -216,7 +217,7 @@ CAPTURES = (
         "https://developer.apple.com/documentation/avfoundation/avdepthdata",
         of_file=partial(_call, "heic.read"),
         suffixes=(".heic", ".heif"),
-        is_ours=partial(_call, "heic.has_depth"),
+        mark=re.compile(rb"urn:mpeg:hevc:2015:auxid:2|urn:mpeg:mpegB:cicp:systems:auxiliary:depth"),
     ),
     Capture(
         "COLMAP",

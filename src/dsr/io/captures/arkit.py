@@ -12,13 +12,14 @@ App's samples, https://github.com/laanlabs/3dScannerApp_samples, have intrinsics
 """
 
 import functools
+import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, create_model
 
 from dsr.io.captures.contract import has_name
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Size, stated
@@ -108,8 +109,8 @@ def _arkitscenes_geometry(place: str, intrinsics: Path | None, motion: _Motion |
     return Geometry(camera, check_pose(place, np.linalg.inv(to_camera)), up="z")
 
 
-class _PolycamCamera(BaseModel, strict=True):
-    """A file of ``cameras``; numbers may be NaN here."""
+class _PolycamIntrinsics(BaseModel, strict=True):
+    """The camera in a file of ``cameras``; numbers may be NaN here."""
 
     fx: float
     fy: float
@@ -117,18 +118,11 @@ class _PolycamCamera(BaseModel, strict=True):
     cy: float
     width: Pixels
     height: Pixels
-    t_00: float
-    t_01: float
-    t_02: float
-    t_03: float
-    t_10: float
-    t_11: float
-    t_12: float
-    t_13: float
-    t_20: float
-    t_21: float
-    t_22: float
-    t_23: float
+
+
+_POSE = [[f"t_{row}{column}" for column in range(4)] for row in range(3)]  # names of the numbers of a pose
+_NUMBERS: dict[str, Any] = dict.fromkeys(itertools.chain(*_POSE), (float, ...))
+_PolycamCamera = create_model("_PolycamCamera", __base__=_PolycamIntrinsics, **_NUMBERS)
 
 
 def find_polycam(folder: Path) -> PairingResult | None:
@@ -164,7 +158,7 @@ def _polycam_geometry(path: Path) -> Geometry:
     """Return camera and pose of a frame."""
     stored = parse_model(_PolycamCamera, read_text(path, _LARGEST_JSON), path, f"expected {_POLYCAM}'s camera; ")
     camera = intrinsics_camera(str(path), (stored.height, stored.width), (stored.fx, stored.fy, stored.cx, stored.cy))
-    rows = [[getattr(stored, f"t_{row}{column}") for column in range(4)] for row in range(3)]
+    rows = [[getattr(stored, name) for name in names] for names in _POSE]
     pose = check_pose(str(path), np.array([*rows, [0, 0, 0, 1]], dtype=np.float64), opengl=True)
     return Geometry(camera, pose, up="y")
 

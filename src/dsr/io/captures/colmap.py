@@ -31,7 +31,7 @@ import numpy as np
 
 from dsr.geometry.camera import Lens
 from dsr.geometry.poses import from_quaternion, invert
-from dsr.io.frames import CaptureFrame, Geometry, Record, Size, Source, file_state, stated
+from dsr.io.frames import CaptureFrame, Geometry, Size, Source, file_state, stated
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult
 from dsr.io.trajectories import check_pose, intrinsics_camera
 from dsr.notes import Assumption
@@ -48,7 +48,6 @@ from dsr.utils.guards import (
     read_text,
     refusing,
 )
-from dsr.utils.versions import hash_once
 
 _APP = "COLMAP"
 _PLACES = (".", "sparse/0", "sparse", "colmap/sparse/0")  # of the model in a folder of photos
@@ -191,7 +190,7 @@ def find_colmap(folder: Path) -> PairingResult | None:
             lone.append(photo)
             continue
         camera = cameras[image.camera]
-        frame = replace(_frame(file, image, camera), depth=_SparseDepth(points, image, camera))
+        frame = replace(_frame(file, image, camera), depth=_SparseDepth(points, image.name, image, camera))
         pairs.append(Pair(Path(image.name).with_suffix("").as_posix(), photo, points, unit=1.0, capture=frame))
     if not pairs:
         return None
@@ -201,12 +200,8 @@ def find_colmap(folder: Path) -> PairingResult | None:
 
 @dataclass(frozen=True, eq=False)
 class _SparseDepth(Source):
-    """The depth of the points that an image shows, from the file of the points.
+    """The depth of the points that an image shows, about a pixel for each; of several in a pixel the nearest."""
 
-    The map has about a pixel for each of them; of several points in a pixel it has the nearest.
-    """
-
-    file: Path
     image: _Image
     camera: _Camera
 
@@ -234,10 +229,6 @@ class _SparseDepth(Source):
         row, column = (rows[order] * size[0] / height).astype(int), (columns[order] * size[1] / width).astype(int)
         depth[row, column] = z[order]
         return depth
-
-    def record(self) -> Record:
-        """Return a hash of the file of points, and the image's name."""
-        return {"file": f"{self.file.name}/{self.image.name}", "sha256": hash_once(self.file)}
 
 
 def _geometry(place: str, quaternion: Sequence[float], translation: Sequence[float], camera: _Camera) -> Geometry:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,8 @@ from dsr.utils.guards import natural_key
 
 if TYPE_CHECKING:
     from dsr.io.pairs import PairingResult
+
+_HEAD = 1 << 20  # bytes at the beginning of a file in which its mark is
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class Capture:
         of_folder: returns the frames of a folder; None if it is another one.
         of_file: returns the frames of a file with one of the ``suffixes``.
         suffixes: of captures that are a single file, in lower case; a folder may have several of them.
-        is_ours: whether a file in a folder is such a capture, not another one of its suffix.
+        mark: in the first megabyte of such a file, and of no other of its suffix; None if the suffix says it.
         marks: patterns of paths below its folder, any of which distinguishes it from others; ``*`` in the last part
             stands for anything. Empty for single files, and for layouts without characteristic names.
         needs: patterns of its parts, alternatives as ``A or B``; those that match nothing are named to the user of a
@@ -47,7 +50,7 @@ class Capture:
     of_folder: Callable[[Path], PairingResult | None] = lambda _: None
     of_file: Callable[[Path], PairingResult] | None = None
     suffixes: tuple[str, ...] = ()
-    is_ours: Callable[[Path], bool] = lambda _: True
+    mark: re.Pattern[bytes] | None = None
     marks: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()
 
@@ -60,12 +63,15 @@ class Capture:
         if found is not None or of_file is None:
             return found
         files = [path for path in place.iterdir() if path.suffix.lower() in self.suffixes and path.is_file()]
-        files = sorted(filter(self.is_ours, files), key=natural_key)
         if not files:
             return None
-        from dsr.io.pairs import join  # noqa: PLC0415 - torch takes seconds to import, and the table needs none
+        # torch takes seconds to import, and the table needs none
+        from dsr.io.captures.archive import read_section  # noqa: PLC0415
+        from dsr.io.pairs import join  # noqa: PLC0415
 
-        return join({path.stem: of_file(path) for path in files})
+        if self.mark is not None:
+            files = [path for path in files if self.mark.search(read_section(path, 0, _HEAD))]
+        return join({path.stem: of_file(path) for path in sorted(files, key=natural_key)}) if files else None
 
     def rows(self) -> dict[str, str]:
         """Return the description, text by label, the name first; empty texts are left out."""

@@ -12,38 +12,31 @@ import functools
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-from dsr.io.frames import CaptureFrame, Geometry, Record, Size, Source
+from dsr.io.frames import CaptureFrame, Geometry, Size, Source
 from dsr.io.pairs import Pair, PairingResult
 from dsr.io.photos import decode_heic, open_heic, read_heic, same_aspect, turned_in_heic
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
-from dsr.utils.guards import MOST_FILE, MOST_TEXT, numbers_in, opened, read_limited
-from dsr.utils.versions import file_hash
+from dsr.utils.guards import MOST_FILE, MOST_TEXT, numbers_in, read_limited
 
 _APP = "HEIC"  # not the device in the EXIF data: the depth is of its two lenses or a network, not of its depth sensor
-_HEAD = 1 << 20  # bytes at the beginning of a file in which its images are listed
-_MARK = re.compile(rb"urn:mpeg:hevc:2015:auxid:2|urn:mpeg:mpegB:cicp:systems:auxiliary:depth")
 _INVERSE_DEPTH, _DISPARITY, _DEPTH = 0, 1, 2  # of HEVC's depth_representation_type
 
 
 @dataclass(frozen=True)
 class _HeicImage(Source):
-    """The photo or the depth map of a HEIC file."""
-
-    file: Path
-    role: Literal["photo", "depth"]
+    """The ``photo`` or the ``depth`` map of a HEIC file."""
 
     def read(self) -> np.ndarray:
         """Return (H, W, 3) uint8 RGB, or (h, w) float32 depth in metres, NaN where there is none."""
-        if self.role == "photo":
+        if self.name == "photo":
             return read_heic(self.file)
         maps = [each for each in open_heic(self.file).info.get("depth_images", ()) if each is not None]
         if not maps:
-            raise ValueError(f"{self.file}: expected a depth map of the photo, there is none that can be read")
+            raise ValueError(f"{self.file}: expected a photo with a depth map, as of portrait mode; none can be read")
         values, metadata = decode_heic(self.file, maps[0]), maps[0].info["metadata"] or {}
         kind = metadata.get("representation_type")
         names = ("d_min", "d_max") if kind == _DISPARITY else ("z_near", "z_far")
@@ -58,15 +51,9 @@ class _HeicImage(Source):
             depth = mapped if kind == _DEPTH else 1 / mapped
         return np.where(np.isfinite(depth) & (depth > 0), depth, np.nan).astype(np.float32)
 
-    def record(self) -> Record:
-        """Return the file's name and hash."""
-        return {"file": f"{self.file.name}/{self.role}", "sha256": file_hash(self.file)}
-
 
 def read(path: Path) -> PairingResult:
     """Return the pair of a HEIC file."""
-    if not has_depth(path):
-        raise ValueError(f"{path}: expected a HEIC photo with a depth map, as of portrait mode; there is none")
     content = read_limited(path, MOST_FILE)
     place = content.find(b"http://ns.apple.com/depthData/")  # in XMP text about the map, if there is some
     first, end = content.rfind(b"<x:xmpmeta", 0, max(place, 0)), content.find(b"</x:xmpmeta>", max(place, 0))
@@ -75,12 +62,6 @@ def read(path: Path) -> PairingResult:
     frame = CaptureFrame(_APP, functools.partial(_geometry, path, xmp), path, xmp, *sources)
     pair = Pair(path.stem, path, path / "depth", unit=1.0, capture=frame)
     return PairingResult((pair,), (Assumption("HEIC photos with depth maps of their own"),))
-
-
-def has_depth(path: Path) -> bool:
-    """Return whether a file lists a depth map."""
-    with opened(path) as file:
-        return _MARK.search(file.read(_HEAD)) is not None
 
 
 def _geometry(path: Path, xmp: bytes, size: Size) -> Geometry:

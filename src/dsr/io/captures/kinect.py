@@ -31,7 +31,6 @@ from dsr.utils.validation import Number, Whole, parse_model
 from dsr.utils.versions import how_to_install
 
 _APP = "Azure Kinect"
-_HEAD, _MARK = 1 << 20, b"K4A_DEPTH_MODE"  # bytes at the beginning of a file in which its tags are, and one of these
 # Bytes of each pixel, and OpenCV's conversion.
 _COLOURS = {
     "NV12": (1.5, cv2.COLOR_YUV2RGB_NV12),
@@ -111,12 +110,6 @@ def _decode(size: Size, kind: str, content: bytes) -> np.ndarray:
         return np.frombuffer(content, ">u2").reshape(size).astype(np.uint16)
     rows = (height * 3 // 2, width, 1) if kind == "NV12" else (height, width, int(each))
     return cv2.cvtColor(np.frombuffer(content, np.uint8).reshape(rows), code)
-
-
-def is_ours(path: Path) -> bool:
-    """Return whether a file is a recording of a Kinect, not another video."""
-    with opened(path) as file:
-        return _MARK in file.read(_HEAD)
 
 
 def read(path: Path) -> PairingResult:

@@ -22,10 +22,11 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, Field
 
+from dsr.geometry.poses import from_quaternion
 from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo, members, read_part
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Part, Size, stated
 from dsr.io.pairs import Pair, PairingResult, numbered_files, paired
-from dsr.io.trajectories import describe_capture, intrinsics_camera, pose_from_quaternion
+from dsr.io.trajectories import ARKIT_TO_DSR, describe_capture, intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import refusing
 from dsr.utils.validation import Whole, parse_model
@@ -132,7 +133,7 @@ def _geometry(place: str, metadata: _Metadata, own: list[float] | None, pose: li
     notes = () if own else (Assumption(text),)
     if pose is None:
         return Geometry(camera, None, notes)
-    return Geometry(camera, pose_from_quaternion(place, pose[:4], pose[4:], opengl=True), notes, up="y")
+    return Geometry(camera, from_quaternion(pose[4:], pose[:4], place) @ ARKIT_TO_DSR, notes, up="y")
 
 
 def decode_lzfse(content: bytes, size: Size, dtype: str) -> np.ndarray:

@@ -208,15 +208,12 @@ class _Info(NamedTuple):
 
 
 def _camera_info(reader: Any, topic: str, role: str) -> _Info | None:
-    """Return the content of the topic beside that of images, for photos or above it; None if there is none.
-
-    Images of a rectified topic have the camera that P states, and no distortion.
-    """
+    """Return the content of the topic beside that of images, for photos or above it; None if there is none."""
     for place in PurePosixPath(topic.removesuffix("/compressedDepth").removesuffix("/compressed")).parents:
         info = first_message(reader, str(place / "camera_info"))
         if info is not None:
             k, d, p = (info.K, info.D, info.P) if hasattr(info, "K") else (info.k, info.d, info.p)
-            rectified = "image_rect" in topic
+            rectified = "image_rect" in topic  # then the camera is that of P, without distortion
             matrix = (p[0], p[5], p[2], p[6]) if rectified and p[0] else (k[0], k[4], k[2], k[5])
             window = info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height
             binning = max(info.binning_x, 1), max(info.binning_y, 1)

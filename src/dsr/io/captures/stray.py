@@ -23,9 +23,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from dsr.geometry.poses import from_quaternion
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Record, Size, Source, file_state
 from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult, numbered_files, paired
-from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera, pose_from_quaternion
+from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera
 from dsr.notes import Assumption
 from dsr.utils.decoding import QUIET_DECODERS
 from dsr.utils.guards import expect_pixels, numbers_in, read_text, refusing
@@ -74,14 +75,14 @@ def frames_of_video(
 
     They may belong to others if the video has another number of frames than there are maps, which is a warning.
     """
-    frames, warnings = {number: VideoFrame(video, number) for number in depths}, []
+    frames, warnings = {number: VideoFrame(video, f"{number:06}", number) for number in depths}, []
     expected = max(frames) + 1
     with contextlib.suppress(ValueError), _LOCK:  # each frame says so when it is read
         count = int(_player(video, file_state(video, "a video")).capture.get(cv2.CAP_PROP_FRAME_COUNT))
         if count != expected:
             text = f"{video.name} has {count} frames, the depth maps count to {expected}: photos may be some frames off"
             warnings.append(Assumption(text))
-    return {number: video / f"{number:06}" for number in frames}, frames, warnings
+    return {number: video / frame.name for number, frame in frames.items()}, frames, warnings
 
 
 def _read_odometry(path: Path) -> dict[int, _Row]:
@@ -115,7 +116,7 @@ def _geometry(folder: Path, number: int, row: _Row, text: str, size: Size) -> Ge
     camera, pose, notes = None, None, []
     if row:
         values = numbers(_POSE)
-        pose = pose_from_quaternion(place, values[3:], values[:3])
+        pose = from_quaternion(values[:3], values[3:], place)
     else:
         notes.append(Assumption("no pose: odometry.csv has none of the frame"))
     intrinsics: list[float] = []
@@ -132,7 +133,7 @@ def _geometry(folder: Path, number: int, row: _Row, text: str, size: Size) -> Ge
     if intrinsics:
         video, sizes = folder / "rgb.mp4", [size]
         if video.is_file() and (folder / "rgb").is_dir():  # extracted photos may have been made smaller
-            height, width, _ = VideoFrame(video, 0).read().shape
+            height, width, _ = VideoFrame(video, "000000", 0).read().shape
             sizes.append((height, width))
         camera = fitting_camera(place, (*sizes, USUAL_SIZE), intrinsics)
     return Geometry(camera, pose, tuple(notes), up="y")
@@ -142,7 +143,6 @@ def _geometry(folder: Path, number: int, row: _Row, text: str, size: Size) -> Ge
 class VideoFrame(Source):
     """The frame of a video with a number from 0, decoded as it is asked for."""
 
-    file: Path
     index: int
 
     def read(self) -> np.ndarray:
@@ -156,9 +156,9 @@ class VideoFrame(Source):
 
 
 class _Player:
-    """A video that is open at some frame."""
+    """A video of a :func:`file_state` that is open at some frame."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, _state: tuple[int, int]) -> None:
         self._path = path
         self._open()
 
@@ -197,7 +197,4 @@ class _Player:
         self.capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # intrinsics are those of the pixels as they are stored
 
 
-@functools.lru_cache(maxsize=1)
-def _player(path: Path, _state: tuple[int, int]) -> _Player:
-    """Return the open video."""
-    return _Player(path)
+_player = functools.lru_cache(maxsize=1)(_Player)  # the open video

@@ -1,4 +1,6 @@
-"""Contact sheets: every scene gets a row with its own colours, numbers and holes; pages are whole or not there."""
+"""Pictures of scenes: contact sheets with a row for each, and that of a result, whatever is unknown of it."""
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -6,7 +8,10 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
+from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import Camera
+from dsr.metrics.catalogue import KNOWN_FORMATS
+from dsr.pictures.panels import save_picture
 from dsr.pictures.sheets import save_contact_sheet
 from dsr.sample import Scene
 
@@ -96,3 +101,22 @@ def test_empty_sheet_is_refused_and_writes_nothing(tmp_path):
     with pytest.raises(ValueError, match=r"toys.png: expected a scene or more for a contact sheet, got none"):
         save_contact_sheet(tmp_path / "toys.png", [], "Toys")
     assert list(tmp_path.iterdir()) == []
+
+
+# The picture of a result
+
+
+@pytest.mark.parametrize("case", ["without truth", "with holes", "of holes alone", "of holes alone, without truth"])
+def test_picture_of_a_result_is_drawn_whatever_is_unknown(tmp_path, case):
+    sample = make_sample(toy_scene(), 4, Downsampling("box"), "orthogonal")
+    sample = replace(sample, depth=None) if "without" in case else sample
+    depth = torch.full((1, 32, 32), torch.nan if "alone" in case else 2.0)
+    if case == "with holes":
+        depth[0, :10], sample.depth[0, 5:20, :9], sample.depth_lr[0, 0] = torch.nan, torch.nan, torch.nan
+    scores = {"RMSE_d": float("nan") if "alone" in case else 0.07, "DSSIM_v": 0.3}
+    save_picture(tmp_path / "pictures" / "scene.png", sample, depth, scores, "Toy", KNOWN_FORMATS)
+    [path] = (tmp_path / "pictures").iterdir()
+    height, width = cv2.imread(str(path)).shape[:2]
+    rows = 2 if sample.depth is None else 3
+    assert width == 2656  # five panels of 3.2 inches and 0.6 inches of margin at 160 dpi
+    assert height == pytest.approx(160 * (0.8 + rows * (3.2 + 0.95)), abs=1)
