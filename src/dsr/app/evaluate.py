@@ -307,16 +307,16 @@ def _evaluate_scenes(prepared: _Prepared, study: Evaluation, progress: Progress)
     found: dict[str, SceneResult] = {}
     left, begun = list(scenes), time.monotonic()
     if prepared.device.type != "cpu" and not prepared.selected.recipe.abilities.optimises:
-        with ThreadPoolExecutor(_BESIDE) as pool:
+        with ThreadPoolExecutor(_BESIDE) as beside:
 
             def results_of(function: Callable[..., Any], items: Sequence[str]) -> Iterator[tuple[str, Any]]:
-                return zip(items, pool.map(functools.partial(function, study), items), strict=True)
+                return zip(items, beside.map(functools.partial(function, study), items), strict=True)
 
             results = _in_workers(results_of, left, since)
             try:
                 found.update(progress.track(results, "evaluate", len(scenes), label=itemgetter(0)))
             except BaseException:  # what has begun is completed
-                pool.shutdown(cancel_futures=True)
+                beside.shutdown(cancel_futures=True)
                 raise
     elif workers == 1 or settings.workers == "auto":
         with computing_threads(threads):

@@ -179,13 +179,15 @@ class PatchData(lightning.LightningDataModule):
         self.setup()
         module: Any = getattr(self.trainer, "lightning_module", None)
         prepare = getattr(getattr(module, "net", None), "prepare", None)
-        collate = functools.partial(_collate_prepared, prepare) if prepare else None
-        workers = self.patches.workers
-        if workers == "auto":
-            workers = 0 if self._training_device().type == "cpu" else max(1, (os.cpu_count() or 1) - 1)
+        collate: Callable[..., Batch] | None = functools.partial(_collate_prepared, prepare) if prepare else None
+        wanted, workers = self.patches.workers, 0
         if isinstance(self._cut, DevicePatches):
             self._cut.store(self._training_device())
-            collate, workers = self._cut.collate, 0
+            collate = self._cut.collate
+        elif wanted != "auto":
+            workers = wanted
+        elif self._training_device().type != "cpu":
+            workers = max(1, (os.cpu_count() or 1) - 1)
         return _PatchLoader(
             self._cut,
             batch_sampler=_PatchNumbers(self.trainer, self.patches.batch),

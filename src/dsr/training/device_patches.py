@@ -18,7 +18,7 @@ from torch.nn import functional
 from dsr.degradation.downsampling import KERNELS, Downsampling, encode_facts, kernel_matrix, known_kernels, local_noise
 from dsr.degradation.noise import GaussianMultiplicative
 from dsr.degradation.random_degradation import Everything
-from dsr.degradation.random_fields import chance, draw, normal, power, uniform
+from dsr.degradation.random_fields import chance, draw, integer, normal, power, uniform
 from dsr.geometry.camera import baseline_times_focal
 from dsr.methods.images import compute_min_max
 from dsr.sample import FARTHEST, NEAREST
@@ -82,7 +82,7 @@ class DevicePatches(Patches):
         relief = torch.zeros(3)  # of grain its amount and width; the step of a file's levels in metres
         if chance(everything.relief, generator):
             if chance(_ROUNDED, generator):
-                relief[2] = (0.001, 0.001, 0.002, 0.005)[int(torch.randint(4, (1,), generator=generator))]
+                relief[2] = (0.001, 0.001, 0.002, 0.005)[integer(0, 3, generator)]
             else:
                 relief[1] = uniform(0, 1.5, generator) if chance(0.6, generator) else 0.0
                 relief[0] = power(-4.6, -3, generator)
@@ -108,7 +108,8 @@ class DevicePatches(Patches):
 
     def store(self, device: torch.device) -> None:
         """Put the scenes on a device."""
-        colours, inverse, self._starts, end = [], [], [], 0
+        colours, inverse, end = [], [], 0
+        self._starts: list[list[int]] = []  # of each scene of a group, in pixels
         for group in self._groups:
             self._starts.append([])
             for scene in group:

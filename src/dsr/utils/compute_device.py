@@ -61,7 +61,7 @@ def made_once(make: Callable[_P, _R]) -> Callable[_P, _R]:
     @torch.compiler.assume_constant_result
     @functools.wraps(make)
     def get(*given: _P.args, **named: _P.kwargs) -> _R:
-        return kept(*given, **named)
+        return kept(*given, **named)  # type: ignore[arg-type]  # they are hashable
 
     return get
 

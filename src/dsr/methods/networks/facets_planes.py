@@ -138,15 +138,17 @@ def _extend_to_centre(padded: Tensor, size: torch.Size, reach: int) -> Tensor:
 def _distances(near: Tensor, reach: int) -> tuple[Tensor, Tensor]:
     """Return how far each pixel is from the rows, (3, 1, h, 1), and columns, (3, 1, w), before, at and after it."""
     height, width = near.shape[-2:]
-    along = _distances_along.__wrapped__ if exporting() else _distances_along  # sizes of a graph are no constants
+    along = _make_distances if exporting() else _distances_along  # sizes of a graph are no constants
     down, across = along(height, reach, near.dtype, near.device), along(width, reach, near.dtype, near.device)
     return down[:, None, :, None], across[:, None]
 
 
-@made_once
-def _distances_along(size: int, reach: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+def _make_distances(size: int, reach: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     places = torch.arange(size, dtype=dtype, device=device)
     return torch.stack((places, torch.zeros_like(places), -places.flip(0))).clamp(-reach, reach)
+
+
+_distances_along = made_once(_make_distances)
 
 
 def mix_planes(planes: Tensor, found: Tensor, scale: int) -> tuple[Tensor, Tensor]:

@@ -49,9 +49,10 @@ class ConvLayer(nn.Module):
         x = self.conv(x)
         if x.device.type != "cpu" or torch.compiler.is_compiling() or self.slopes != 1:
             return self.activation(x)
+        slope = self.activation.get_parameter("weight")
         if torch.is_inference(x):  # in place, to save memory, but only here, where no gradient can be requested
-            return functional.leaky_relu_(x, float(self.activation.weight))
-        return _SharedPReLU.apply(x, self.activation.weight)
+            return functional.leaky_relu_(x, float(slope))
+        return _SharedPReLU.apply(x, slope)
 
 
 class _SharedPReLU(torch.autograd.Function):
