@@ -58,11 +58,14 @@ def made_once(make: Callable[_P, _R]) -> Callable[_P, _R]:
     """
     kept = functools.lru_cache(64)(torch.inference_mode(mode=False)(make))
 
-    @torch.compiler.assume_constant_result
     @functools.wraps(make)
     def get(*given: _P.args, **named: _P.kwargs) -> _R:
+        if torch.compiler.is_compiling():  # or exporting, by tensors without values, which must not be kept
+            return make(*given, **named)
         return kept(*given, **named)  # type: ignore[arg-type]  # they are hashable
 
+    # As torch.compiler.assume_constant_result does, which first imports the compiler, a second of every command
+    get._dynamo_marked_constant = True  # type: ignore[attr-defined]
     return get
 
 
@@ -78,7 +81,7 @@ def known_true(flags: Tensor) -> bool:
 
 
 def pick_device(name: str, fast_on: str = "any", precision: str = "float32") -> torch.device:
-    """Return the device of that name; on a GPU, convolutions and products in float32 use TF32 for ``tf32`` alone.
+    """Return the device of that name; on a GPU, convolutions in float32 use TF32 for ``tf32`` alone, products never.
 
     ``auto`` is $DSR_DEVICE, else the first GPU where there is one and the method is ``fast_on`` any, else the CPU.
     """
@@ -95,7 +98,8 @@ def pick_device(name: str, fast_on: str = "any", precision: str = "float32") -> 
     except (RuntimeError, AssertionError) as error:  # torch asserts that it was built for CUDA
         raise ConfigError(f"{given_by}: expected auto, cpu or a device of this machine, got {name!r}") from error
     if device.type == "cuda":
-        torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = precision == "tf32"
+        torch.backends.cudnn.allow_tf32 = precision == "tf32"
+        torch.backends.cuda.matmul.allow_tf32 = False  # maps are enlarged and averaged by products of matrices
     elif precision == "tf32":
         raise ConfigError(
             f"precision: expected auto, float32 or bfloat16 on device={device}, got tf32, which GPUs have"

@@ -104,6 +104,13 @@ class FacetsUNet(DisparityNetwork):
         self.blend = silence(nn.Conv2d(width, facets * len(_REACHES) * NEIGHBOURS, 3, padding=1))
         self.gate = silence(nn.Conv2d(HEAD, 1, 3, padding=1))
 
+        self._project = _project
+
+    def compile(self, *arguments: Any, **named: Any) -> None:
+        """Let torch compile the network, but for the projection, whose indices differ from step to step."""
+        self._project = torch.compiler.disable(_project)
+        super().compile(*arguments, **named)
+
     @classmethod
     def serves(cls, trained: int, scale: int) -> bool:
         """Return whether weights trained for a factor are for another one, too."""
@@ -249,7 +256,7 @@ class FacetsUNet(DisparityNetwork):
         result, errors, gate = (_join(each) for each in zip(*bits, strict=True))
         if given.shape == values.shape:  # not for a map of the photo's own size
             with torch.autocast(rgb.device.type, enabled=False):
-                result = _project(result, given, known, gate, kernels)
+                result = self._project(result, given, known, gate, kernels)
         return result, errors
 
     def _split(self, height: int, shape: torch.Size) -> list[tuple[slice, slice]]:
@@ -326,7 +333,6 @@ def _lr_input(around: Stencil, weight: Tensor, noise: Tensor, hints: Tensor) -> 
     return torch.cat(parts, dim=1)
 
 
-@torch.compiler.disable  # whose indices differ from step to step
 def _project(result: Tensor, values: Tensor, known: Tensor, gate: Tensor, kernels: Sequence[str | None]) -> Tensor:
     """Return results closer to what was measured, where the kernel is known."""
     scale = result.shape[-1] // values.shape[-1]
