@@ -134,7 +134,8 @@ def test_random_kernels_noise_relief_and_hints_are_distributed_as_workers_make_t
 
 @pytest.mark.parametrize(
     ("change", "key"),
-    [({"noise": Kinect()}, "noise"), ({"downsampling": Downsampling("box", range_type="orthogonal")}, "downsampling"),
+    [({"noise": Kinect()}, "noise"), ({"noise": GaussianMultiplicative(0.3)}, "noise"),
+     ({"downsampling": Downsampling("box", range_type="orthogonal")}, "downsampling"),
      *(({"everything": {name: 0.1}}, f"degradation.{name}") for name in UNMADE),
      ({"everything": {"holes": {"none": 1, "blobs": 1}}}, "degradation.holes"),
      ({"everything": {"noises": {"stereo": 1}}}, "degradation.noises"),
@@ -181,7 +182,7 @@ def test_holes_of_a_truth_are_left_to_workers_and_refused_where_a_device_is_to_m
         _data(*scenes, on_device=True).setup()
     with pytest.raises(ValueError, match=r"^on_device: .* degradation\.folds is left"):
         _data(on_device=True, everything=Everything())
-    data = _data(*scenes, device="cuda")
+    data = _data(*scenes, device="cuda", on_device="auto")
     data.setup()
     assert "places" not in data.first_patches(1)[0]
 

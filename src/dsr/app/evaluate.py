@@ -307,7 +307,8 @@ def _evaluate_scenes(prepared: _Prepared, study: Evaluation, progress: Progress)
     found: dict[str, SceneResult] = {}
     left, begun = list(scenes), time.monotonic()
     if prepared.device.type != "cpu" and not prepared.selected.recipe.abilities.optimises:
-        with ThreadPoolExecutor(_BESIDE) as beside:
+        together = 1 if settings.precision == "tf32" else _BESIDE  # which scores switch off, for all threads
+        with computing_threads(threads), ThreadPoolExecutor(together) as beside:
 
             def results_of(function: Callable[..., Any], items: Sequence[str]) -> Iterator[tuple[str, Any]]:
                 return zip(items, beside.map(functools.partial(function, study), items), strict=True)

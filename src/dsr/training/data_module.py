@@ -172,7 +172,9 @@ class PatchData(lightning.LightningDataModule):
         patches = self._cut.make(batch)
         net: Any = getattr(getattr(self.trainer, "lightning_module", None), "net", None)
         offset = patches["doffs"] if getattr(net, "of_inverse_depth", False) else 0
-        return {**patches, "filled": patches["disparity_lr"] + offset}  # there are no holes to fill
+        patches["filled"] = patches["disparity_lr"] + offset  # there are no holes to fill
+        prepare = getattr(net, "prepare", dict)
+        return prepare(patches)  # type: ignore[no-any-return]
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Return a loader of an epoch's patches, which begins at the trainer's current step."""
@@ -187,7 +189,8 @@ class PatchData(lightning.LightningDataModule):
         elif wanted != "auto":
             workers = wanted
         elif self._training_device().type != "cpu":
-            workers = max(1, (os.cpu_count() or 1) - 1)
+            devices = 1 if self.trainer is None else self.trainer.num_devices  # of this machine, a process each
+            workers = max(1, _count_cores() // devices - 1)
         return _PatchLoader(
             self._cut,
             batch_sampler=_PatchNumbers(self.trainer, self.patches.batch),
@@ -208,6 +211,11 @@ class PatchData(lightning.LightningDataModule):
         return [DataLoader(each, batch_size=None) for each in batches]
 
     test_dataloader = predict_dataloader = val_dataloader
+
+
+def _count_cores() -> int:
+    """Return how many cores this process may use, of which a cluster's job has a part."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _split(source: SceneSource, settings: PatchSettings) -> tuple[list[str], list[str]]:

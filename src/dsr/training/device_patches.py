@@ -2,8 +2,9 @@
 
 The scenes are stored there, colours in 8 bits. The CPU draws numbers alone: a window, how it is mirrored, turned and
 changed, a kernel, seeds. Fields of random numbers are functions of their seeds, so patch number i is a function of
-(seed, i), here as well. The patches are those of :class:`~dsr.training.patches.Patches` but for these fields. Sensors,
-holes, folds, soft steps and JPEG are not made here, and scenes have no holes.
+(seed, i), here as well. They are distributed as those of :class:`~dsr.training.patches.Patches`, and the same ones if
+no photo, noise or kernel is drawn. Sensors, holes, folds, soft steps, levels of disparity and JPEG are not made here,
+and scenes have no holes.
 """
 
 import functools
@@ -28,6 +29,7 @@ from dsr.training.patches import Patches, draw_changes, mirror_camera
 _UNMADE = ("folds", "displaced", "rounded", "soft", "photo", "textured", "clear")  # of Everything, by workers alone
 _ROUNDED = 0.3  # share of the reliefs that are a file's levels
 _RADIUS = 6  # pixels: of the widest Gaussian
+_STRONGEST = 0.16  # standard deviation of noise that turns no disparity, which would be a hole
 _MIXED = (-0x61C8864680B583EB, -0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15)  # of SplitMix64 (Steele et al. 2014)
 
 
@@ -36,7 +38,9 @@ def made_by_workers(degradation: Degradation, everything: Everything | None) -> 
     if everything is None:
         if degradation.downsampling.range_type not in (None, "disparity"):
             return "downsampling.range_type"
-        return "" if isinstance(degradation.noise, GaussianMultiplicative | None) else "noise"
+        noise = degradation.noise
+        weak = noise is None or (isinstance(noise, GaussianMultiplicative) and noise.std <= _STRONGEST)
+        return "" if weak else "noise"
     for name in _UNMADE:
         if getattr(everything, name):
             return f"degradation.{name}"

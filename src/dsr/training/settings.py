@@ -36,7 +36,7 @@ class PatchSettings:
     validation_scenes: int = 4
     scenes: int | None = None
     workers: int | Literal["auto"] = "auto"
-    on_device: bool | Literal["auto"] = "auto"
+    on_device: bool | Literal["auto"] = False  # as runs that were begun without this key, which go on as they began
     flip: bool = True
     rotate: bool = True
     depth_scale: float = 0.3
@@ -58,7 +58,7 @@ class PatchSettings:
             raise ValueError(f"scenes: expected a positive number, or null for all, got {self.scenes}")
         expect_memory("patch", self.patch, _BYTES * self.patch**2)
         expect_memory("batch", self.batch, _BYTES * self.batch * self.patch**2)
-        if self.on_device not in (True, False, "auto"):
+        if self.on_device != "auto" and not isinstance(self.on_device, bool):
             raise ValueError(f"on_device: expected true, false or auto, got {self.on_device}")
         if self.workers != "auto":
             expect_memory("workers", self.workers, _BYTES_OF_WORKER * self.workers)
