@@ -7,7 +7,7 @@ import functools
 import json
 import math
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 
 import numpy as np
 import pandas as pd
@@ -390,6 +390,14 @@ def test_scenes_of_several_threads_are_predicted_one_at_a_time_and_written_as_on
         results = dict(zip(content, pool.map(functools.partial(evaluate_scene, studies[1]), content), strict=True))
     write_tables(studies[1], results)
     assert rows(tmp_path / "together") == rows(tmp_path / "apart")
+
+
+def test_no_prediction_begins_after_the_end_of_turns(tmp_path):
+    study = toy_study(tmp_path)
+    study.turns.end()
+    with pytest.raises(CancelledError):
+        evaluate_scene(study, "a")
+    assert not (tmp_path / "predictions").exists()
 
 
 def test_scene_without_a_solution_is_a_result_and_no_failure_and_its_earlier_prediction_goes(tmp_path):

@@ -10,7 +10,7 @@ import math
 import random
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from operator import itemgetter
@@ -308,20 +308,14 @@ def _evaluate_scenes(prepared: _Prepared, study: Evaluation, progress: Progress)
     left, begun = list(scenes), time.monotonic()
     if prepared.device.type != "cpu" and not prepared.selected.recipe.abilities.optimises:
         together = 1 if settings.precision == "tf32" else _BESIDE  # which scores switch off, for all threads
-        with computing_threads(threads), ThreadPoolExecutor(together) as beside:
-
-            def results_of(function: Callable[..., Any], items: Sequence[str]) -> Iterator[tuple[str, Any]]:
-                return zip(items, beside.map(functools.partial(function, study), items), strict=True)
-
-            results = _in_workers(results_of, left, since)
-            try:
-                found.update(progress.track(results, "evaluate", len(scenes), label=itemgetter(0)))
-            except BaseException:  # what has begun is completed
-                beside.shutdown(cancel_futures=True)
-                raise
-    elif workers == 1 or settings.workers == "auto":
         with computing_threads(threads):
-            for scene in progress.track(free_first(study.folder, scenes), "evaluate", len(scenes)):
+            results = _in_threads(study, scenes, since, together, progress)
+            found.update(progress.track(results, "evaluate", len(scenes), label=itemgetter(0)))
+        left = [scene for scene in scenes if scene not in found]
+    if left and (workers == 1 or settings.workers == "auto"):
+        with computing_threads(threads):
+            waiting = free_first(study.folder, left)
+            for scene in progress.track(waiting, "evaluate", len(scenes), done=len(found)):
                 found[scene] = evaluate_scene(study, scene, since, progress)
                 left.remove(scene)
                 needed = len(left) * (time.monotonic() - begun) / len(found)
@@ -329,20 +323,34 @@ def _evaluate_scenes(prepared: _Prepared, study: Evaluation, progress: Progress)
                     break
     if left:
         with Pool(min(workers, len(left)), _begin, (prepared,), threads, progress.say) as pool:
-            results = _in_workers(pool.results, left, since)
+            results = _in_workers(pool, left, since)
             for scene, result in progress.track(results, "evaluate", len(scenes), done=len(found), label=itemgetter(0)):
                 found[scene] = result
     return {scene: found[scene] for scene in scenes}
 
 
-def _in_workers(
-    results_of: Callable[..., Iterable[tuple[str, SceneResult | None]]], left: list[str], since: float
+def _in_threads(
+    study: Evaluation, scenes: Sequence[str], since: float, count: int, progress: Progress
 ) -> Iterator[tuple[str, SceneResult]]:
+    """Yield the scenes with their results, without those that other commands work on."""
+    evaluate_one = functools.partial(_in_worker, study, wait=False, since=since, progress=progress)
+    with ThreadPoolExecutor(count) as beside:
+        try:
+            for scene, result in zip(scenes, beside.map(evaluate_one, scenes), strict=True):
+                if result is not None:
+                    yield scene, result
+        except BaseException:  # no further prediction begins
+            study.turns.end()
+            beside.shutdown(cancel_futures=True)
+            raise
+
+
+def _in_workers(pool: Pool, left: list[str], since: float) -> Iterator[tuple[str, SceneResult]]:
     """Yield the scenes with their results; those that other commands work on come last."""
     try:
         for wait in (False, True):
             evaluate_one = functools.partial(_in_worker, wait=wait, since=since)
-            for scene, result in results_of(evaluate_one, tuple(left)):
+            for scene, result in pool.results(evaluate_one, tuple(left)):
                 if result is not None:
                     left.remove(scene)
                     yield scene, result
@@ -357,10 +365,12 @@ def _begin(prepared: _Prepared) -> Evaluation:
         return _study(prepared, _method(prepared, SILENT))
 
 
-def _in_worker(study: Evaluation, scene: str, *, wait: bool, since: float) -> SceneResult | None:
+def _in_worker(
+    study: Evaluation, scene: str, *, wait: bool, since: float, progress: Progress = SILENT
+) -> SceneResult | None:
     """Evaluate a scene in a worker; None if another process works on it, unless its end is waited for."""
     for _ in free_first(study.folder, [scene], wait=wait):
-        return evaluate_scene(study, scene, since)
+        return evaluate_scene(study, scene, since, progress)
     return None
 
 

@@ -14,6 +14,7 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Mapping
+from concurrent.futures import CancelledError
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,28 @@ SCORE_COLUMNS = (
 Illustrate = Callable[[DepthSample, Tensor, tuple[Tensor, Tensor] | None, Mapping[str, float]], None]
 
 
+class Turns:
+    """A lock for predictions, of which threads make one at a time; after its end it refuses to be taken."""
+
+    def __init__(self) -> None:
+        self._lock, self._ended = threading.Lock(), False
+
+    def __enter__(self) -> None:
+        """Wait for the lock."""
+        self._lock.acquire()
+        if self._ended:
+            self._lock.release()
+            raise CancelledError
+
+    def __exit__(self, *_: object) -> None:
+        """Release the lock."""
+        self._lock.release()
+
+    def end(self) -> None:
+        """Let those that wait for the lock fail, as after an interruption."""
+        self._ended = True
+
+
 @dataclass(frozen=True)
 class Evaluation:
     """The evaluation of one method on one data set."""
@@ -68,7 +91,7 @@ class Evaluation:
     alignment: str = "none"  # of each prediction before it is scored and drawn
     label: str = ""  # name in tables; empty for ``method_name``
     illustrate: Illustrate = lambda *_: None
-    turns: threading.Lock = field(default_factory=threading.Lock)  # for predictions of one at a time
+    turns: Turns = field(default_factory=Turns)
 
     def sample(self, scene: str) -> DepthSample:
         """Return the method's input for a scene; a ValueError if a file of the scene is invalid."""
