@@ -168,9 +168,9 @@ def test_step_of_facets_waits_for_no_gpu_and_takes_as_many_operations_for_any_ba
         module = SuperResolution(FacetsUNet(4, width=8, deep=8), SurfaceObjective()).to(gpu)
         optimizer = torch.optim.AdamW(module.net.parameters(), fused=True)
         for size in (1, 6):
-            batch = module.net.prepare(default_collate([patches[number] for number in range(size)]))
-            moved = {key: value.to(gpu) if isinstance(value, torch.Tensor) else value for key, value in batch.items()}
-            for warm in (False, True):
+            for warm, numbers in ((False, range(24)), (True, range(24, 24 + size))):  # all kernels, then other images
+                batch = module.net.prepare(default_collate([patches[number] for number in numbers]))
+                moved = {key: each.to(gpu) if isinstance(each, torch.Tensor) else each for key, each in batch.items()}
                 operations = _Operations()
                 with operations if warm else contextlib.nullcontext():
                     module.loss_terms(moved)["loss"].backward()

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dsr.degradation.downsampling import FACTS, Downsampling, known_kernels
+from dsr.degradation.downsampling import FACTS, KERNELS, Downsampling, known_kernels
 from dsr.methods.images import exporting, inpaint, repeat_blocks, upsample_bicubic
 from dsr.methods.networks.facets import (
     HEAD,
@@ -256,7 +256,7 @@ class FacetsUNet(DisparityNetwork):
         result, errors, gate = (_join(each) for each in zip(*bits, strict=True))
         if given.shape == values.shape:  # not for a map of the photo's own size
             with torch.autocast(rgb.device.type, enabled=False):
-                result = self._project(result, given, known, gate, kernels)
+                result = self._project(result, given, known, gate, hints, kernels)
         return result, errors
 
     def _split(self, height: int, shape: torch.Size) -> list[tuple[slice, slice]]:
@@ -333,7 +333,9 @@ def _lr_input(around: Stencil, weight: Tensor, noise: Tensor, hints: Tensor) -> 
     return torch.cat(parts, dim=1)
 
 
-def _project(result: Tensor, values: Tensor, known: Tensor, gate: Tensor, kernels: Sequence[str | None]) -> Tensor:
+def _project(
+    result: Tensor, values: Tensor, known: Tensor, gate: Tensor, hints: Tensor, kernels: Sequence[str | None]
+) -> Tensor:
     """Return results closer to what was measured, where the kernel is known."""
     scale = result.shape[-1] // values.shape[-1]
     places = {kernel: [i for i, each in enumerate(kernels) if each == kernel] for kernel in kernels if kernel}
@@ -343,9 +345,12 @@ def _project(result: Tensor, values: Tensor, known: Tensor, gate: Tensor, kernel
             model = Downsampling(kernel)  # type: ignore[arg-type]
             if len(images) == len(kernels):
                 seen = model(result, scale, complete=True)
-            else:
-                index = constant(tuple(images), torch.int64, result.device)
+            elif result.device.type == "cpu":
+                index = torch.tensor(images)
                 seen = seen.index_copy(0, index, model(result[index], scale, complete=True))
+            else:  # which would wait for a copy of the indices
+                of_kernel = hints[:, KERNELS.index(kernel), None, None, None] > 0  # type: ignore[arg-type]
+                seen = torch.where(of_kernel, model(result, scale, complete=True), seen)
         residual = torch.where(known, values - seen, 0)
         result = result + gate.to(result.dtype) * upsample_bicubic(residual, scale)
     return result
