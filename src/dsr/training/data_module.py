@@ -174,7 +174,7 @@ class PatchData(lightning.LightningDataModule):
         offset = patches["doffs"] if getattr(net, "of_inverse_depth", False) else 0
         patches["filled"] = patches["disparity_lr"] + offset  # there are no holes to fill
         prepare = getattr(net, "prepare", dict)
-        return prepare(patches)  # type: ignore[no-any-return]
+        return prepare(patches)
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Return a loader of an epoch's patches, which begins at the trainer's current step."""

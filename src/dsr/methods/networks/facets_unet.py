@@ -349,7 +349,7 @@ def _project(
                 index = torch.tensor(images)
                 seen = seen.index_copy(0, index, model(result[index], scale, complete=True))
             else:  # which would wait for a copy of the indices
-                of_kernel = hints[:, KERNELS.index(kernel), None, None, None] > 0  # type: ignore[arg-type]
+                of_kernel = hints[:, KERNELS.index(kernel), None, None, None] > 0
                 seen = torch.where(of_kernel, model(result, scale, complete=True), seen)
         residual = torch.where(known, values - seen, 0)
         result = result + gate.to(result.dtype) * upsample_bicubic(residual, scale)
