@@ -4,6 +4,7 @@ import pytest
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
+from lightning.pytorch.callbacks import EarlyStopping, LearningRateMonitor
 
 import dsr
 from dsr.app.schema import TrainConfig, plain_config
@@ -42,6 +43,16 @@ def test_model_is_the_lightning_module_with_its_optimiser_and_schedule(name: str
     assert made["optimizer"].defaults["lr"] == 0.02
     schedule = made["lr_scheduler"]["scheduler"]
     assert [schedule.lr_lambdas[0](step) for step in (0, 10)] == [pytest.approx(1 / 300), pytest.approx(11 / 300)]
+
+
+def test_other_optimisers_schedules_and_callbacks_are_nodes() -> None:
+    more = ["optimizer=sgd", "scheduler=constant", "callbacks=[default,early_stopping,learning_rate]"]
+    config = dsr.compose("train", more)
+    made = instantiate(config.model).configure_optimizers()
+    assert type(made["optimizer"]) is torch.optim.SGD
+    assert type(made["lr_scheduler"]["scheduler"]) is torch.optim.lr_scheduler.ConstantLR
+    kinds = {type(instantiate(node)) for node in config.callbacks.values()}
+    assert kinds >= {EarlyStopping, LearningRateMonitor}
 
 
 def test_composed_configuration_names_its_choices(monkeypatch: pytest.MonkeyPatch) -> None:
