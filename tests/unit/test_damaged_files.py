@@ -112,6 +112,11 @@ def test_bomb_is_refused_in_one_line_and_little_memory(tmp_path, limited, writte
     assert "expected" in refusal(tmp_path / name, read, tmp_path / name)
 
 
+def test_archive_of_arrays_is_not_unpacked_to_more_than_its_size_explains(written):
+    with pytest.raises(TooLargeError, match="expected at most 268435456 bytes"):
+        read_arrays(written(bombs.npz))
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="needs limits of memory")
 def test_command_limits_its_memory_to_that_of_the_machine_or_of_its_container(tmp_path, monkeypatch):
     physical = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -66,6 +66,8 @@ def test_frames_can_be_chosen_in_the_configuration(tmp_path):
                              for number in (0, 7)))  # fmt: skip
     entries = {**node("icl"), "root": root, "frames": {**ICL_FRAMES, "sofa": "y/0007"}, "scenes": ["sofa", "x_0000"]}
     assert build("dataset", entries).scenes() == ["sofa", "x_0000"]
+    with pytest.raises(ConfigError, match="got 1 of 6 scenes"):  # the others are not those of the paper
+        build("dataset", {**entries, "scenes": None})
     with pytest.raises(ConfigError, match=r"dataset\.frames: expected .*, got \['a'\]"):
         build("dataset", {**entries, "frames": ["a"]})
 

@@ -24,6 +24,7 @@ DIFFERENT = {
     "method/msg_v_noisy": {"variant"},
     "model/msg": {"variant"},  # trained by the project; the class's is the published MSG-V
     "model/msg_v": {"variant"},
+    **{f"dataset/{name}": {"frames"} for name in ("icl", "sunrgbd")},  # the paper's; the class's are all
     "dataset/simgeo": {"root"},  # on the command line the folder of data is looked at for Lucy
     **{f"method/{peer}": {"weights", "weights_files"} for peer in PEERS},  # none where a network is given
 }  # Files whose keys are what tells one choice from another of the same class, by the keys

@@ -48,6 +48,8 @@ USAGE_ERRORS = {
     "method=": "method=: ",
     "scale": "scale: expected KEY=VALUE",
     "output_dir=a=b": "output_dir=a=b: expected KEY=VALUE",
+    "dataset.size=[1,2": r"dataset.size=\[1,2: expected KEY=VALUE",
+    "=3": "=3: ",
     "method=msg,msg_v": "method: expected one value, got several; ",
     "--config-name=other": ".*'other'",
     "--config-dir=nowhere": "--config-dir: expected a directory, got nowhere",

@@ -99,8 +99,8 @@ def test_photos_of_a_folder_are_found_among_those_without_depth(tmp_path):
     pillow_heif.from_pillow(Image.fromarray(captures.photo())).save(tmp_path / "plain.heic")
     pairs = pickle.loads(pickle.dumps(find_pairs_of_folder(tmp_path).pairs))
     assert [pair.name for pair in pairs] == ["a", "b"]
-    with pytest.raises(ValueError, match=r"plain\.heic: expected a photo with a depth map"):
-        only(tmp_path / "plain.heic")
+    with pytest.raises(ValueError, match=r"plain\.heic: expected HEIC photos with depth, got another \.heic file"):
+        find_pairs_of_folder(tmp_path / "plain.heic")
 
 
 @pytest.mark.parametrize("upright", [True, False])

@@ -13,12 +13,21 @@ from dsr.methods.classical.fast_global_smoother import FastGlobalSmoother
 from dsr.methods.classical.guided_filter import GuidedFilter
 from dsr.methods.classical.interpolation import Interpolation
 from dsr.methods.classical.tgv import TotalGeneralisedVariation
+from dsr.methods.recipe import read_recipe
 
 GUIDED = {"guided_filter": GuidedFilter, "joint_bilateral": JointBilateral, "smoother": FastGlobalSmoother}
 EXACT = {**GUIDED, "edge_guided": EdgeGuided}
 ORDERS = {order: partial(Interpolation, order) for order in ("nearest", "bilinear", "bicubic")}
 PLANAR = {**EXACT, "tgv": partial(TotalGeneralisedVariation, iterations=300)}
 FILLING = {**EXACT, **ORDERS, "bilateral": Bilateral}
+
+
+def test_low_resolution_maps_average_what_the_paper_averages_for_a_method():
+    kinds = {name: read_recipe(name).kind.range_type for name in ("bicubic", "msg_v", "facets", "dip", "dip_v")}
+    assert kinds == {
+        "bicubic": "perspective", "msg_v": "disparity", "facets": "disparity", "dip": "orthogonal",
+        "dip_v": "orthogonal",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8, 16])

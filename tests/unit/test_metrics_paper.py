@@ -2,6 +2,7 @@
 
 import copy
 import math
+import pickle
 from functools import partial
 from typing import NamedTuple
 
@@ -221,11 +222,12 @@ def test_images_that_cannot_be_scored_are_left_out():
         assert metric.compute().item() == pytest.approx(alone.compute().item(), rel=1e-12)
 
 
-def test_states_of_two_processes_add_up_and_one_that_a_metric_is_for_suffices():
-    here, there = (visual_metrics(protocols=("paper", "field")) for _ in range(2))
+def test_states_of_two_processes_add_up_and_one_that_a_metric_is_for_suffices(network):
+    here, there = (visual_metrics(network, protocols=("paper", "field")) for _ in range(2))
     levels = SurfacePair(*_ramp(1).given, _ramp(1).rays, unit=Unit("levels", inverse=True, factor=8.0))
     here(_ramp(0, batch=2))
     there(levels)
+    there = pickle.loads(pickle.dumps(there))
     for metric, other in zip(here.values(), there.values(), strict=True):
         metric.merge_state(other)
     means = compute_means(here)

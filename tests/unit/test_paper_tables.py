@@ -206,8 +206,8 @@ def published_value(scene, method, scale=4, key="RMSE_d"):
 @pytest.mark.parametrize(
     "settings",
     [
-        {"downsampling": "nearest"}, {"range_type": "orthogonal"}, {"dataset": "sunrgbd"}, {"size": 64}, {"scale": 2},
-        {"method": "mine"}, {"dataset": "icl", "scene": "plant"}, {"scene": "cube_no_texture"},
+        {"downsampling": "nearest"}, {"range_type": "orthogonal"}, {"dataset": "sunrgbd"}, {"size": 64}, {"crop": 0.0},
+        {"scale": 2}, {"method": "mine"}, {"dataset": "icl", "scene": "plant"}, {"scene": "cube_no_texture"},
         {"scene": "cube_no_texture", "dataset": "mine", "_target_": "dsr.data.folder.Folder"},
         {"scene": "vintage", "dataset": "middlebury", "without_offset": []},
         {"scene": "vintage", "dataset": "mine", "_target_": "dsr.data.folder.Folder", "without_offset": []},

@@ -278,6 +278,16 @@ def test_directory_is_searched_for_the_authors_names(tmp_path, monkeypatch):
     assert recipe.with_weights(tmp_path).weights(8) == renamed
 
 
+@pytest.mark.parametrize(
+    ("method", "scale"),
+    [*((name, scale) for name in ("pgsr", "dctnet", "svlrm") for scale in (4, 8, 16)),
+     *(("dornet", scale) for scale in (8 / 3, 4, 8)), ("fdkn", 8),
+     *(("msg", scale) for scale in (2, 4, 8, 16)), ("msg_v", 4), ("msg_v", 8), ("msg_v_noisy", 4)],
+)  # fmt: skip
+def test_files_of_the_authors_have_the_names_and_shapes_of_the_networks(shared, method, scale):
+    read_recipe(method).with_weights(shared / "weights" / ("" if "msg" in method else "peers")).build(scale)
+
+
 SIZES = [(4, 6), (5, 7), (5, 4), (6, 5), (1, 3), (4, 1), (1, 2), (1, 1)]
 
 

@@ -15,6 +15,7 @@ from dsr.geometry.camera import Camera
 from dsr.io.depth_files import write_depth_file
 from dsr.io.scene_files import (
     Frame,
+    parse_pose,
     to_millimetres,
     write_open3d,
     write_rerun,
@@ -222,6 +223,12 @@ def test_rerun_recording_is_read_back(make, tmp_path):
         np.testing.assert_allclose(photo[4:, :, 2], 255 * number / 10, atol=4)
     assert columns["/camera/depth", "frame"] == [0, 1]
     assert ("/camera/depth", "time") not in columns
+
+
+@pytest.mark.parametrize("value", ["no list", np.eye(4)[:3].tolist(), (2 * np.eye(4)).tolist()])
+def test_pose_that_is_not_rigid_is_refused(value):
+    with pytest.raises(ValueError, match=r"^info.json: pose: expected a rigid transform of 4 x 4 numbers, got "):
+        parse_pose("info.json: pose", value)
 
 
 def test_damaged_depth_of_a_frame_is_refused(make):

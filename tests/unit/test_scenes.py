@@ -140,6 +140,10 @@ def test_scores_are_those_of_the_stored_prediction(tmp_path):
         (entry.metric, entry.variant): entry.value
         for entry in score_image(prediction.double(), RAMP + 1, CAMERA.rays(), catalogue())
     }
+    header, first = (tmp_path / "scores.csv").read_text().splitlines()[:2]
+    assert header == "dataset,scene,scale,downsampling,method,seed,metric,variant,value,valid_share"
+    assert first.startswith("toy,a,2,box,toy_method,7,")
+    assert first.endswith(",1.0")
     table = {(row["metric"], row["variant"]): float(row["value"]) for row in rows(tmp_path) if row["scene"] == "b"}
     assert table == pytest.approx(expected, rel=1e-12)
 

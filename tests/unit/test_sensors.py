@@ -169,7 +169,7 @@ def test_sensor_is_identified_by_what_is_given_then_by_values_then_by_files():
     stereo = counted(1024)
     assert identify(stereo)[:2] == (BY_NAME["RealSense D435"], "values")
     assert identify(stereo).constant == pytest.approx(1024, rel=0.002)
-    for part in (848 / 1280, 0.5):  # modes, 640 x 480 is cropped
+    for part in (848 / 1280, 0.6, 0.5):  # modes, 640 x 480 is cropped
         assert identify(counted(1024 * part)).sensor is BY_NAME["RealSense D435"]
         assert identify(counted(1024 * part), "d435i")[:2] == (BY_NAME["RealSense D435"], "request")
     assert identify(stereo, device_name="Intel RealSense D435I").by == "file"

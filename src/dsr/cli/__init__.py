@@ -16,7 +16,7 @@ from dsr.app import requests
 from dsr.app.upsample.request import UpsampleRequest
 from dsr.doctor import version_lines
 from dsr.utils import interruption
-from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, show
+from dsr.utils.console import USAGE_ERROR, one_line, open_console, print_error, printable, show
 from dsr.utils.files import FullDiskError
 from dsr.utils.guards import did_you_mean, refusing_excess
 from dsr.utils.options import Options, add_options, build
@@ -62,6 +62,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 class Parser(argparse.ArgumentParser):
     """A parser, and those of its commands, which says what may be meant."""
+
+    def error(self, message: str) -> NoReturn:
+        """Exit with the usage and the error, which repeats arguments: names of files may control a terminal."""
+        super().error(printable(message))
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse; an unknown option is reported before what is missing, which it may stand for."""

@@ -87,7 +87,7 @@ def prepare_scenes(source: SceneSource, names: Sequence[str], progress: Progress
 def subset(source: SceneSource, names: Sequence[str]) -> SceneSource:
     """Return a data set of some of its scenes."""
     part = copy.copy(source)
-    vars(part)["scenes"] = functools.partial(list, names)
+    vars(part)["scenes"] = functools.partial(list, names)  # whatever the class's method returns
     return part
 
 

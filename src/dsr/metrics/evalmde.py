@@ -144,9 +144,15 @@ def boundary_error(pair: SurfacePair) -> Tensor:
 
 def sawa_h(pair: SurfacePair) -> Tensor:
     """Return SAWA-H, (B,), see the module; lower is better."""
-    fitted, weights = beyond(pair), (3.65, 0.18, 0.01, 0.20, 1.94)
-    parts = (wkdr(pair), fitted["disparity"], fitted["depth"], boundary_error(pair), rel_normal(pair))
-    return torch.stack([weight * part.double() for weight, part in zip(weights, parts, strict=True)]).sum(dim=0)
+    fitted = beyond(pair)
+    parts = (
+        (3.65, wkdr(pair)),
+        (0.18, fitted["disparity"]),
+        (0.01, fitted["depth"]),
+        (0.20, boundary_error(pair)),
+        (1.94, rel_normal(pair)),
+    )
+    return torch.stack([weight * part.double() for weight, part in parts]).sum(dim=0)
 
 
 def _taken(values: Tensor, source: Tensor) -> Tensor:

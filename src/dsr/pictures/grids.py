@@ -86,7 +86,7 @@ def _wrap(text: str, length: float) -> str:
 
 
 class _Page(Canvas):
-    """A page of panels; a picture's label, and that of the frame of an empty panel, is ``ROW: panel``."""
+    """A page of panels; labels are ``ROW: panel``, also of the frame of an empty one, and ``ROW: detail``."""
 
     def text(self, x: float, y: float, text: str, **style: Any) -> None:
         """Write a text."""

@@ -253,7 +253,8 @@ def inputs_of(pair: Pair, reading: Reading) -> dict[str, Path | Source]:
     return {name: each for name, each in found.items() if each is not None}
 
 
-def _record_of(pair: Pair, reading: Reading) -> dict[str, Record]:
+def _records_of(pair: Pair, reading: Reading) -> dict[str, Record]:
+    """Return the names and hashes of :func:`inputs_of`."""
     inputs: dict[str, Record] = {}
     for name, each in inputs_of(pair, reading).items():
         if not isinstance(each, Path):
@@ -267,9 +268,9 @@ def _record_of(pair: Pair, reading: Reading) -> dict[str, Record]:
 
 def inputs_with_neighbours(request: UpsampleRequest, pair: Pair, neighbours: Sequence[Pair]) -> dict[str, Record]:
     """Return the inputs of a frame, its neighbours and its pose, and their hashes, as values for JSON."""
-    inputs = _record_of(pair, request.reading)
+    inputs = _records_of(pair, request.reading)
     for number, other in enumerate(neighbours, 1):
-        inputs |= {f"neighbour_{number}_{name}": each for name, each in _record_of(other, request.reading).items()
+        inputs |= {f"neighbour_{number}_{name}": each for name, each in _records_of(other, request.reading).items()
                    if name not in ("rgb", "depth_camera", "extrinsics")}  # fmt: skip
     poses = request.frames.model or request.frames.poses
     if poses is not None:

@@ -46,7 +46,6 @@ _SHOWN = 5  # number of names that a line lists; further ones are only counted
 _KEPT = 2**26  # numbers in the photos that were read last and are kept
 _WHITE = 1.5  # noise that is alike over fewer pixels counts as white
 _GLASS = 0.005  # share of the pixels that look like glass from which it is said
-_work: FrameWork | None = None  # of this process, if it is a worker
 
 
 class Done(NamedTuple):
@@ -169,17 +168,15 @@ def work_through(request: UpsampleRequest, frames: Frames, tell: Tell, progress:
             yield from (Done(*job, problem=str(error)) for job in left)
 
 
-def _begin(request: UpsampleRequest, frames: Frames) -> None:
+def _begin(request: UpsampleRequest, frames: Frames) -> FrameWork:
     """Prepare a worker, which reads frames again only for their neighbours."""
-    global _work  # noqa: PLW0603 - the process's own
-    _work = FrameWork(request, frames, kept=_KEPT if request.frames.neighbours else 0)
+    return FrameWork(request, frames, kept=_KEPT if request.frames.neighbours else 0)
 
 
-def _remote(job: tuple[Pair, Path]) -> tuple[Done, list[Message]]:
+def _remote(work: FrameWork, job: tuple[Pair, Path]) -> tuple[Done, list[Message]]:
     """Upsample a frame in a worker, and return what is to be told of it, too."""
-    assert _work is not None  # noqa: S101 - workers begin with _begin
     messages: list[Message] = []
-    return _work(*job, messages.append, Progress()), messages
+    return work(*job, messages.append, Progress()), messages
 
 
 def _check_poses(request: UpsampleRequest, frames: Frames, console: Console) -> None:

@@ -32,7 +32,7 @@ from dsr.notes import warn
 from dsr.pictures.canvas import encode_row
 
 Array = TypeVar("Array", np.ndarray, Tensor)
-# of `dsr upsample`, which Surface.save takes
+# options of `dsr upsample` that Surface.save takes
 _OPTIONS = ("format", "max_error", "certain", "max_faces", "max_points", "keep", "overwrite")
 
 

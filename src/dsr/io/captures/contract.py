@@ -58,20 +58,26 @@ class Capture:
         """Return the frames of a file, of a folder, or of the files in a folder; None if it is another capture."""
         of_file = self.of_file
         if place.is_file():
-            return of_file(place) if of_file is not None and place.suffix.lower() in self.suffixes else None
+            if of_file is None or place.suffix.lower() not in self.suffixes:
+                return None
+            if not self._has_mark(place):
+                raise ValueError(f"{place}: expected {self.name}, got another {place.suffix} file")
+            return of_file(place)
         found = self.of_folder(place)
         if found is not None or of_file is None:
             return found
         files = [path for path in place.iterdir() if path.suffix.lower() in self.suffixes and path.is_file()]
         if not files:
             return None
-        # torch takes seconds to import, and the table needs none
-        from dsr.io.captures.archive import read_section  # noqa: PLC0415
-        from dsr.io.pairs import join  # noqa: PLC0415
+        from dsr.io.pairs import join  # noqa: PLC0415 - torch takes seconds to import, and the table needs none
 
-        if self.mark is not None:
-            files = [path for path in files if self.mark.search(read_section(path, 0, _HEAD))]
-        return join({path.stem: of_file(path) for path in sorted(files, key=natural_key)}) if files else None
+        files = sorted(filter(self._has_mark, files), key=natural_key)
+        return join({path.stem: of_file(path) for path in files}) if files else None
+
+    def _has_mark(self, path: Path) -> bool:
+        from dsr.io.captures.archive import read_section  # noqa: PLC0415 - as above
+
+        return self.mark is None or self.mark.search(read_section(path, 0, _HEAD)) is not None
 
     def rows(self) -> dict[str, str]:
         """Return the description, text by label, the name first; empty texts are left out."""

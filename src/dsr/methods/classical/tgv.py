@@ -205,7 +205,10 @@ def gradient(x: Tensor) -> Tensor:
 
 
 def divergence(p: Tensor, sign: int = -1) -> Tensor:
-    """Return minus the adjoint of :func:`gradient`, (B, 2, C, H, W) -> (B, C, H, W); sign 1: of its absolute values."""
+    """Return minus the adjoint of :func:`gradient`, (B, 2, C, H, W) -> (B, C, H, W).
+
+    With ``sign`` 1 it is the adjoint of the gradient's absolute coefficients, of which step sizes are made.
+    """
     total = torch.zeros_like(p[:, 0])
     for direction, dim in ((0, -1), (1, -2)):
         count = p.shape[dim] - 1
