@@ -283,9 +283,10 @@ def _run(prepared: _Prepared, method: Method, progress: ConsoleProgress) -> pd.D
         if settings.overwrite:
             shutil.rmtree(folder / WORKSPACE, ignore_errors=True)
         _seed(settings.seed)
+        named = settings.label or prepared.selected.recipe.name
+        progress.say(f"method {named} x{round_ratio(settings.scale)}, {settings.precision} on {prepared.device}")
         prepare_scenes(source, source.scenes(), progress)
         study = _study(prepared, method)
-        progress.say(f"method {study.label} x{round_ratio(study.scale)}, {settings.precision} on {prepared.device}")
         for remark in method.remarks(source.name, source.scenes(), study.scale):
             note_once(remark)
         results = _evaluate_scenes(prepared, study, progress)

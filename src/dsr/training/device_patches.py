@@ -7,7 +7,6 @@ no photo, noise or kernel is drawn. Sensors, holes, folds, soft steps, levels of
 and scenes have no holes.
 """
 
-import functools
 import math
 from collections.abc import Sequence
 
@@ -25,6 +24,7 @@ from dsr.methods.images import compute_min_max
 from dsr.sample import FARTHEST, NEAREST
 from dsr.training.degradation import Batch, Degradation, least_range
 from dsr.training.patches import Patches, draw_changes, mirror_camera
+from dsr.utils.compute_device import made_once
 
 _UNMADE = ("folds", "displaced", "rounded", "soft", "photo", "textured", "clear")  # of Everything, by workers alone
 _ROUNDED = 0.3  # share of the reliefs that are a file's levels
@@ -103,9 +103,7 @@ class DevicePatches(Patches):
 
     def collate(self, items: Sequence[Batch]) -> Batch:
         """Return the numbers of a batch, and of hints the kernels, which a step has to know without asking a device."""
-        batch: Batch = {
-            name: torch.stack([each[name] for each in items]) for name in items[0] if name not in ("scale", "kernels")
-        }
+        batch: Batch = {name: torch.stack([each[name] for each in items]) for name in items[0] if name != "scale"}
         if "facts" in batch:
             batch |= {"scale": items[0]["scale"], "kernels": known_kernels(batch["facts"])}
         return batch
@@ -229,6 +227,6 @@ def _downsample(values: Tensor, models: tuple[Downsampling, ...], scale: int, ki
     return (chosen @ values[:, 0] @ chosen.transpose(1, 2))[:, None]
 
 
-@functools.lru_cache(8)
+@made_once
 def _matrices(models: tuple[Downsampling, ...], size: int, scale: int, device: torch.device) -> Tensor:
     return torch.stack([kernel_matrix(model, size, scale, torch.float32, device) for model in models])
