@@ -162,6 +162,8 @@ def _read(config: DictConfig, *, here: bool = True) -> tuple[dict[str, Any], Tra
         if others := ", ".join(key for key in given_keys() if key not in _RESUMABLE):
             raise ConfigError(f"resume: continues with the run's own configuration; {others} cannot be changed")
         before = read_config(folder, plain["trust"])
+        if isinstance(before.get("patches"), dict):
+            before["patches"].setdefault("on_device", False)  # as runs that were begun without this key
         device = {"device": plain["device"]} if "device" in given_keys() else {}
         plain = {**before, **device, "resume": None, "output_dir": str(folder), "overwrite": False, "trust": None}
     settings = TrainConfig.of(plain)

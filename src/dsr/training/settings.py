@@ -36,7 +36,7 @@ class PatchSettings:
     validation_scenes: int = 4
     scenes: int | None = None
     workers: int | Literal["auto"] = "auto"
-    on_device: bool | Literal["auto"] = False  # as runs that were begun without this key, which go on as they began
+    on_device: bool | Literal["auto"] = "auto"
     flip: bool = True
     rotate: bool = True
     depth_scale: float = 0.3
