@@ -157,16 +157,17 @@ def find_processes(device: torch.device, devices: int | Literal["auto"]) -> Proc
 def _read(config: DictConfig, *, here: bool = True) -> tuple[dict[str, Any], TrainConfig, torch.device]:
     """Return the configuration, perhaps of the run to resume, its checked settings and the device to train on."""
     plain = plain_config(config)
-    if plain.get("resume") is not None:
+    resumed = plain.get("resume") is not None
+    if resumed:
         folder = Path(plain["resume"]).expanduser()
         if others := ", ".join(key for key in given_keys() if key not in _RESUMABLE):
             raise ConfigError(f"resume: continues with the run's own configuration; {others} cannot be changed")
         before = read_config(folder, plain["trust"])
-        if isinstance(before.get("patches"), dict):
-            before["patches"].setdefault("on_device", False)  # as runs that were begun without this key
         device = {"device": plain["device"]} if "device" in given_keys() else {}
         plain = {**before, **device, "resume": None, "output_dir": str(folder), "overwrite": False, "trust": None}
     settings = TrainConfig.of(plain)
+    if resumed:
+        settings.patches.setdefault("on_device", False)  # as runs that were begun without this key
     chosen = pick_device(settings.device, precision=settings.precision) if here else torch.device("cpu")
     if settings.precision == "auto":
         plain["precision"] = settings.precision = fast_precision(chosen)
