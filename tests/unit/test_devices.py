@@ -209,7 +209,7 @@ def test_inference_of_facets_asks_a_gpu_once_whether_there_are_holes():
     assert operations.count < 700
 
 
-@pytest.mark.parametrize(("net", "breaks"), [(MSGNet, 0), (FacetsUNet, 1)])
+@pytest.mark.parametrize(("net", "breaks"), [(MSGNet, 0), pytest.param(FacetsUNet, 1, marks=pytest.mark.nightly)])
 @pytest.mark.filterwarnings("ignore")
 def test_network_is_one_graph_beside_what_differs_from_step_to_step(net, breaks):
     """Its C++ is not compiled here, which takes minutes."""
