@@ -1,8 +1,8 @@
 """What files say, without what differs between two undisturbed runs.
 
 That is: seconds in predictions, ``summary.json``, ``info.json`` and pages; which scenes were predicted and which ones
-reused; the date of a PDF; logs of TensorBoard, in which a resumed run may repeat steps; hidden temporary files, which a
-command that is killed may leave.
+reused; the date of a PDF; logs of TensorBoard, in which a resumed run may repeat steps; hidden temporary files
+and folders, which a command that is killed may leave.
 """
 
 import json
@@ -21,11 +21,9 @@ LOG = "events.out.tfevents."
 
 def files_of(folder: Path) -> dict[str, Path]:
     """Return the files below a folder that are compared, by their relative paths."""
-    return {
-        str(path.relative_to(folder)): path
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and not path.name.startswith((".", LOG))
-    }
+    files = {path.relative_to(folder): path for path in sorted(folder.rglob("*")) if path.is_file()}
+    hidden = {place for place in files if any(part.startswith((".", LOG)) for part in place.parts)}
+    return {str(place): path for place, path in files.items() if place not in hidden}
 
 
 def content(path: Path) -> Any:

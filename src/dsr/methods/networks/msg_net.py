@@ -41,13 +41,14 @@ class ConvLayer(nn.Module):
 
     def __init__(self, conv: nn.Conv2d | nn.ConvTranspose2d, slopes: int) -> None:
         super().__init__()
-        self.conv, self.slopes = conv, slopes
+        self.conv = conv
         self.activation = nn.PReLU(slopes) if slopes else nn.Identity()
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, C_in, H, W) to (B, C_out, H', W')."""
         x = self.conv(x)
-        if x.device.type != "cpu" or torch.compiler.is_compiling() or self.slopes != 1:
+        shared = isinstance(self.activation, nn.PReLU) and self.activation.num_parameters == 1
+        if not shared or x.device.type != "cpu" or torch.compiler.is_compiling():
             return self.activation(x)
         slope = self.activation.get_parameter("weight")
         if torch.is_inference(x):  # in place, to save memory, but only here, where no gradient can be requested
