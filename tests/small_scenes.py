@@ -1,10 +1,13 @@
 """Small scenes and maps of closed form, for the tests of many methods."""
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from dsr.data.scene_source import SceneSource
 from dsr.degradation.downsampling import Downsampling, Kernel, make_sample
 from dsr.geometry.camera import Camera, from_range, to_range
 from dsr.sample import DepthSample, Scene
@@ -22,6 +25,21 @@ def sample_of(
     rgb = torch.zeros(3, height, width) if rgb is None else rgb
     scene = Scene("set", "hall", rgb, camera, from_range(disparity[None], camera, "disparity"))
     return make_sample(scene, scale, Downsampling(kernel), "disparity")
+
+
+class SceneList(SceneSource):
+    """A data set to train on, of scenes in memory."""
+
+    name, evaluation = "set", False
+
+    def __init__(self, scenes: Iterable[Scene]) -> None:
+        self._scenes = {scene.name: scene for scene in scenes}
+
+    def load(self, scene: str) -> Scene:
+        return self._scenes[scene]
+
+    def fingerprint(self, scene: str) -> str:
+        return scene
 
 
 def seeded(seed: int = 0) -> torch.Generator:

@@ -8,9 +8,8 @@ import pytest
 import torch
 from pretend_cuda import pretend_cuda
 from scipy import ndimage, stats
-from small_scenes import sample_of
+from small_scenes import SceneList, sample_of
 
-from dsr.data.scene_source import SceneSource
 from dsr.degradation.downsampling import KERNELS, Downsampling
 from dsr.degradation.holes import HOLES
 from dsr.degradation.noise import NOISES, GaussianMultiplicative, Kinect
@@ -150,26 +149,10 @@ def test_what_workers_alone_make_is_named(change, key):
     assert bool(made_by_workers(degradation, everything)) == bool(key)
 
 
-class _Source(SceneSource):
-    name, evaluation = "set", False
-
-    def __init__(self, *scenes):
-        self._scenes = {scene.name: scene for scene in scenes}
-
-    def scenes(self):
-        return list(self._scenes)
-
-    def load(self, scene):
-        return self._scenes[scene]
-
-    def fingerprint(self, scene):
-        return scene
-
-
 def _data(*scenes, device="cpu", everything=None, **settings):
     named = {"patch": 32, "batch": 2, "validation_scenes": 1, **settings}
     degradation = Degradation(4, Downsampling("box"))
-    parts = [Part(_Source(*(scenes or map(_scene, range(3)))))]
+    parts = [Part(SceneList(scenes or map(_scene, range(3))))]
     return PatchData(parts, PatchSettings(**named), degradation, everything=everything, device=device)
 
 

@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from small_scenes import SceneList
 
-from dsr.data.scene_source import SceneSource
 from dsr.degradation.downsampling import Downsampling, Measured, encode_facts
 from dsr.degradation.noise import GaussianMultiplicative, Kinect
 from dsr.degradation.random_degradation import Everything
@@ -62,28 +62,9 @@ def _same(first, second):
     return all(torch.equal(first[name], second[name]) for name in first)
 
 
-class _Source(SceneSource):
-    """A data set of six scenes."""
-
-    name = "set"
-    evaluation = False
-
-    def __init__(self, scenes):
-        self._scenes = {scene.name: scene for scene in scenes}
-
-    def scenes(self):
-        return list(self._scenes)
-
-    def load(self, scene):
-        return self._scenes[scene]
-
-    def fingerprint(self, scene):
-        return scene
-
-
 def _data(scenes=None, degradation=X4, **changes):
     return PatchData(
-        [Part(_Source(scenes or [_scene(i) for i in range(6)]))], _settings(**changes), degradation, seed=7
+        [Part(SceneList(scenes or [_scene(i) for i in range(6)]))], _settings(**changes), degradation, seed=7
     )
 
 
@@ -191,7 +172,7 @@ def test_parts_give_patches_by_their_fractions_and_scenes_in_turn_also_with_spar
 
 
 def test_parts_hold_out_the_last_of_their_first_scenes_under_distinct_names():
-    sources = [_Source([_scene(i) for i in numbers]) for numbers in ((0, 1, 2, 5), (3, 4))]
+    sources = [SceneList([_scene(i) for i in numbers]) for numbers in ((0, 1, 2, 5), (3, 4))]
     data = PatchData([Part(source) for source in sources], _settings(validation_scenes=1, scenes=3), X4)
     assert data.trained == [(sources[0], ["scene0", "scene1"]), (sources[1], ["scene3"])]
     assert data.held_out == {"set": (sources[0], ["scene2"]), "set_2": (sources[1], ["scene4"])}
@@ -200,8 +181,8 @@ def test_parts_hold_out_the_last_of_their_first_scenes_under_distinct_names():
 
 
 def test_other_datasets_validate_whole_and_alone_where_nothing_is_held_out():
-    more = {"mine": _Source([_scene(8), BARE, _scene(9)])}
-    data = PatchData([Part(_Source([_scene(0)]))], _settings(validation_scenes=0), X4, validation=more)
+    more = {"mine": SceneList([_scene(8), BARE, _scene(9)])}
+    data = PatchData([Part(SceneList([_scene(0)]))], _settings(validation_scenes=0), X4, validation=more)
     data.setup()
     assert {name: scenes for name, (_, scenes) in data.held_out.items()} == {"mine": ["scene8", "scene9"]}
     with pytest.raises(ValueError, match=r"^validation_scenes: expected"):
@@ -209,7 +190,7 @@ def test_other_datasets_validate_whole_and_alone_where_nothing_is_held_out():
 
 
 def test_training_scene_cannot_validate_under_another_name():
-    class _Copies(_Source):
+    class _Copies(SceneList):
         def fingerprint(self, scene):
             return "the same" if scene in ("scene1", "scene8") else scene
 
@@ -373,7 +354,10 @@ REFUSALS = {
         )
         for shares in ([0.0], [2.0, -1.0], [2.0, float("nan")], [2.0, float("inf")])
     },
-    "a share": (lambda: PatchData([Part(_Source([_scene()]), share=-1.0)], _settings(), X4), "^share of .*, got -1.0"),
+    "a share": (
+        lambda: PatchData([Part(SceneList([_scene()]), share=-1.0)], _settings(), X4),
+        "^share of .*, got -1.0",
+    ),
     "too few scenes": (lambda: _data(validation_scenes=6), "^validation_scenes: expected fewer than the 6 scenes"),
     "a patch in 4": (lambda: _data(patch=30), "^patch: expected a size that scale=4 divides"),
     "a patch in 16": (lambda: _data(degradation=Degradation(16, BOX), patch=24), "^patch: .*scale=16 divides, got 24"),
@@ -381,8 +365,8 @@ REFUSALS = {
     "a small scene": (lambda: _patches([_scene(), SMALL], patch=32), "^patch: expected at most scene1's 30 x 60"),
     "no truth": (lambda: _data([BARE, *map(_scene, range(3))]).setup(), "^bare: expected a true depth, there is none"),
     "no truth to validate with": (
-        lambda: PatchData([Part(_Source([_scene()]))], _settings(validation_scenes=0), X4,
-                          validation={"mine": _Source([BARE])}).setup(),
+        lambda: PatchData([Part(SceneList([_scene()]))], _settings(validation_scenes=0), X4,
+                          validation={"mine": SceneList([BARE])}).setup(),
         "^validation.mine: expected scenes with a true depth, there is none",
     ),
     "no part": (lambda: Patches([], _settings(), X4), "expected a scene or more"),

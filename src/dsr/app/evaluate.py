@@ -307,10 +307,10 @@ def _evaluate_scenes(prepared: _Prepared, study: Evaluation, progress: Progress)
     since = time.time() if settings.overwrite else -math.inf
     found: dict[str, SceneResult] = {}
     left, begun = list(scenes), time.monotonic()
-    if prepared.device.type != "cpu" and not prepared.selected.recipe.abilities.optimises:
-        together = 1 if settings.precision == "tf32" else _BESIDE  # which scores switch off, for all threads
+    overlap = prepared.device.type != "cpu" and not prepared.selected.recipe.abilities.optimises
+    if overlap and settings.precision != "tf32":  # which scores switch off, for all threads
         with computing_threads(threads):
-            results = _in_threads(study, scenes, since, together, progress)
+            results = _in_threads(study, scenes, since, progress)
             found.update(progress.track(results, "evaluate", len(scenes), label=itemgetter(0)))
         left = [scene for scene in scenes if scene not in found]
     if left and (workers == 1 or settings.workers == "auto"):
@@ -331,11 +331,11 @@ def _evaluate_scenes(prepared: _Prepared, study: Evaluation, progress: Progress)
 
 
 def _in_threads(
-    study: Evaluation, scenes: Sequence[str], since: float, count: int, progress: Progress
+    study: Evaluation, scenes: Sequence[str], since: float, progress: Progress
 ) -> Iterator[tuple[str, SceneResult]]:
     """Yield the scenes with their results, without those that other commands work on."""
     evaluate_one = functools.partial(_in_worker, study, wait=False, since=since, progress=progress)
-    with ThreadPoolExecutor(count) as beside:
+    with ThreadPoolExecutor(_BESIDE) as beside:
         try:
             for scene, result in zip(scenes, beside.map(evaluate_one, scenes), strict=True):
                 if result is not None:

@@ -164,9 +164,13 @@ def _positive(values: Tensor) -> Tensor:
 
 
 def _white(values: Tensor, _: Tensor, generator: torch.Generator) -> Tensor:
+    return values * (1 + draw_white_strength(generator) * field_of(values, 0, generator))
+
+
+def draw_white_strength(generator: torch.Generator) -> float:
+    """Return a random standard deviation of white noise, relative to the values."""
     strongest = chance(0.4, generator)  # as of simulated time of flight: 1 % and more
-    strength = power(-2.2, -1.3, generator) if strongest else power(-3.4, -1.4, generator)
-    return values * (1 + strength * field_of(values, 0, generator))
+    return power(-2.2, -1.3, generator) if strongest else power(-3.4, -1.4, generator)
 
 
 def _correlated(values: Tensor, _: Tensor, generator: torch.Generator) -> Tensor:

@@ -33,6 +33,9 @@ from dsr.utils.guards import derived, unchecked
 
 # Kinds of noise that stand for a sensor, which does not see glass; the others stand for maps made of a surface
 SENSOR_NOISES = ("waves", "structured", "flight", "lidar", "stereo")
+ROUNDED = 0.3  # share of the reliefs that are a file's levels
+STEPS = (0.001, 0.001, 0.002, 0.005)  # metres between a file's levels
+GRAIN = (-4.6, -3)  # range of the decadic logarithm of the grain's height over the inverse depth
 
 
 @dataclass(frozen=True)
@@ -182,10 +185,15 @@ def plain() -> None:
 def add_relief(scene: Scene, generator: torch.Generator) -> Scene:
     """Return a scene whose true depth has grain of 1 to 4 pixels, as of a scan, or is rounded, as in a file."""
     values = scene.true_depth.reciprocal()
-    if chance(0.3, generator):
+    if chance(ROUNDED, generator):
         return derived(scene, depth=round_values(values, generator).reciprocal())
-    grain = field_of(values.float(), uniform(0, 1.5, generator) if chance(0.6, generator) else 0, generator)
-    return derived(scene, depth=(values * (1 + power(-4.6, -3, generator) * grain)).reciprocal())
+    grain = field_of(values.float(), draw_grain_width(generator), generator)
+    return derived(scene, depth=(values * (1 + power(*GRAIN, generator) * grain)).reciprocal())
+
+
+def draw_grain_width(generator: torch.Generator) -> float:
+    """Return a random standard deviation of the Gaussian that blurs grain, in pixels; 0 for white grain."""
+    return uniform(0, 1.5, generator) if chance(0.6, generator) else 0.0
 
 
 def add_folds(scene: Scene, generator: torch.Generator) -> Scene:
@@ -221,7 +229,7 @@ def displace(values: Tensor, scale: int, generator: torch.Generator) -> Tensor:
 def round_values(values: Tensor, generator: torch.Generator) -> Tensor:
     """Round to millimetres of depth, or to 8 bits of disparity."""
     if chance(0.6, generator):
-        step = (0.001, 0.001, 0.002, 0.005)[integer(0, 3, generator)]
+        step = STEPS[integer(0, 3, generator)]
         return ((values.reciprocal() / step).round() * step).clamp(min=step).reciprocal()
     top = float(values.nan_to_num(0).max()) * uniform(1, 1.3, generator)
     return ((values / top * 255).round() / 255 * top).clamp(min=top / 255)

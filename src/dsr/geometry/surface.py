@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.geometry.lights import LIGHT_NAMES, LIGHTS, VIEWING_LIGHT
+from dsr.utils.compute_device import constant
 
 # brightness of a surface that faces away from the light and of one that faces it, and the exponent between them
 VIEWING_TONES = (0.06, 0.9, 1.25)
@@ -72,7 +73,7 @@ def _repeat_last(values: Tensor, dim: int) -> Tensor:
 
 def lights(*, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
     """Return the paper's lights e1..e4 in the camera frame, (4, 3) unit vectors that point from surface to light."""
-    return torch.tensor([light.direction for light in LIGHTS.values()], dtype=dtype, device=device)
+    return constant(tuple(light.direction for light in LIGHTS.values()), dtype, torch.device(device))
 
 
 def shade(normals: Tensor, directions: Tensor) -> Tensor:

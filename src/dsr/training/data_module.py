@@ -97,7 +97,7 @@ class PatchData(lightning.LightningDataModule):
         self.trained: list[tuple[SceneSource, list[str]]] = []  # data sets and names of their scenes to train on
         # likewise to validate with, by validation set; scenes without a true depth leave it at ``setup``
         self.held_out: dict[str, tuple[SceneSource, list[str]]] = {}
-        self._makes_patches(made_by_workers(degradation, everything))
+        self._makes_patches()  # before scenes are rendered
         held_out: list[tuple[str, SceneSource, list[str]]] = []
         for part in parts:
             if not 0 <= part.share < math.inf:
@@ -130,11 +130,7 @@ class PatchData(lightning.LightningDataModule):
             [derived(scene, depth=scene.true_depth.float()) for scene in map(source.load, names)]
             for source, names in self.trained
         ]
-        patches = Patches
-        if self._makes_patches(made_by_workers(self._degradation, self._everything)):
-            holed = any(bool(scene.true_depth.isnan().any()) for group in groups for scene in group)
-            patches = DevicePatches if self._makes_patches("a true depth with holes" if holed else "") else Patches
-        self._cut = patches(
+        self._cut = (DevicePatches if self._makes_patches(groups) else Patches)(
             groups, self.patches, self._degradation, shares=self._shares, seed=self._seed, everything=self._everything,
             per_step=self._per_step,
         )  # fmt: skip
@@ -145,15 +141,24 @@ class PatchData(lightning.LightningDataModule):
             self.held_out[kind] = (source, [scene.name for scene in known])
             self._validation.append(known)
 
+    @property
+    def _net(self) -> Any:
+        return getattr(getattr(self.trainer, "lightning_module", None), "net", None)
+
     def _training_device(self) -> torch.device:
         return self._device if self.trainer is None else self.trainer.strategy.root_device
 
-    def _makes_patches(self, left_to_workers: str) -> bool:
+    def _makes_patches(self, groups: Sequence[Sequence[Scene]] = ()) -> bool:
         """Return whether the training's device makes the patches; a ValueError if it is to make what it cannot."""
         wanted = self.patches.on_device
+        if not wanted or (wanted == "auto" and self._training_device().type == "cpu"):
+            return False
+        left_to_workers = made_by_workers(self._degradation, self._everything)
+        if any(bool(scene.true_depth.isnan().any()) for group in groups for scene in group):
+            left_to_workers = left_to_workers or "a true depth with holes"
         if left_to_workers and wanted is True:
             raise ValueError(f"on_device: expected false or auto, {left_to_workers} is left to workers")
-        return not left_to_workers and (wanted is True or (wanted == "auto" and self._training_device().type != "cpu"))
+        return not left_to_workers
 
     def first_patches(self, count: int) -> list[Batch]:
         """Return the first ``count`` patches of the run."""
@@ -170,17 +175,15 @@ class PatchData(lightning.LightningDataModule):
         if "places" not in batch or not isinstance(self._cut, DevicePatches):
             return batch
         patches = self._cut.make(batch)
-        net: Any = getattr(getattr(self.trainer, "lightning_module", None), "net", None)
-        offset = patches["doffs"] if getattr(net, "of_inverse_depth", False) else 0
+        offset = patches["doffs"] if getattr(self._net, "of_inverse_depth", False) else 0
         patches["filled"] = patches["disparity_lr"] + offset  # there are no holes to fill
-        prepare = getattr(net, "prepare", dict)
+        prepare: Callable[[Batch], Batch] = getattr(self._net, "prepare", dict)
         return prepare(patches)
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Return a loader of an epoch's patches, which begins at the trainer's current step."""
         self.setup()
-        module: Any = getattr(self.trainer, "lightning_module", None)
-        prepare = getattr(getattr(module, "net", None), "prepare", None)
+        prepare = getattr(self._net, "prepare", None)
         collate: Callable[..., Batch] | None = functools.partial(_collate_prepared, prepare) if prepare else None
         wanted, workers = self.patches.workers, 0
         if isinstance(self._cut, DevicePatches):

@@ -16,9 +16,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from dsr.degradation.downsampling import KERNELS, Downsampling, encode_facts, kernel_matrix, known_kernels, local_noise
-from dsr.degradation.noise import GaussianMultiplicative
-from dsr.degradation.random_degradation import Everything
-from dsr.degradation.random_fields import chance, draw, integer, normal, power, uniform
+from dsr.degradation.noise import GaussianMultiplicative, draw_white_strength
+from dsr.degradation.random_degradation import GRAIN, ROUNDED, STEPS, Everything, draw_grain_width
+from dsr.degradation.random_fields import chance, draw, integer, normal, power
 from dsr.geometry.camera import baseline_times_focal
 from dsr.methods.images import compute_min_max
 from dsr.sample import FARTHEST, NEAREST
@@ -27,7 +27,6 @@ from dsr.training.patches import Patches, draw_changes, mirror_camera
 from dsr.utils.compute_device import made_once
 
 _UNMADE = ("folds", "displaced", "rounded", "soft", "photo", "textured", "clear")  # of Everything, by workers alone
-_ROUNDED = 0.3  # share of the reliefs that are a file's levels
 _RADIUS = 6  # pixels: of the widest Gaussian
 _STRONGEST = 0.16  # standard deviation of noise that turns no disparity, which would be a hole
 _MIXED = (-0x61C8864680B583EB, -0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15)  # of SplitMix64 (Steele et al. 2014)
@@ -75,7 +74,7 @@ class DevicePatches(Patches):
                 [camera.fx, camera.fy, camera.cx, camera.cy, baseline_times_focal(camera), camera.doffs],
                 dtype=torch.float64,
             ),
-            "gain": torch.as_tensor(changes.gain, dtype=torch.float32).expand(3, 1, 1),
+            "gain": torch.as_tensor(changes.gain, dtype=torch.float32),
             "photo": torch.tensor([exponent, sigma, spread]),
             "factor": torch.tensor(changes.factor),
             "seeds": torch.randint(2**62, (3,), generator=generator),
@@ -85,15 +84,13 @@ class DevicePatches(Patches):
             return {**batch, "extent": torch.tensor([low, high, weight])}
         relief = torch.zeros(3)  # of grain its amount and width; the step of a file's levels in metres
         if chance(everything.relief, generator):
-            if chance(_ROUNDED, generator):
-                relief[2] = (0.001, 0.001, 0.002, 0.005)[integer(0, 3, generator)]
+            if chance(ROUNDED, generator):
+                relief[2] = STEPS[integer(0, 3, generator)]
             else:
-                relief[1] = uniform(0, 1.5, generator) if chance(0.6, generator) else 0.0
-                relief[0] = power(-4.6, -3, generator)
+                relief[1] = draw_grain_width(generator)
+                relief[0] = power(*GRAIN, generator)
         kernel, noise = draw(everything.kernels, generator), draw(everything.noises, generator)
-        strength = 0.0
-        if noise == "white":
-            strength = power(-2.2, -1.3, generator) if chance(0.4, generator) else power(-3.4, -1.4, generator)
+        strength = draw_white_strength(generator) if noise == "white" else 0.0
         told = [chance(everything.told, generator) for _ in range(3)]
         facts = encode_facts(kernel if told[0] else None, False if told[1] else None, noise=told[2])
         known = told[2] * math.exp(0.15 * normal(generator))
@@ -176,8 +173,7 @@ class DevicePatches(Patches):
 
     def _take_photos(self, rgb: Tensor, batch: Batch) -> Tensor:
         """Change the colours, gamma and blur of photos (B, 3, H, W), and add noise."""
-        rgb = rgb * batch["gain"]
-        rgb = rgb.clamp(0, 1)
+        rgb = (rgb * batch["gain"]).clamp(0, 1)
         if not self._settings.photo:
             return rgb
         exponent, sigma, spread = batch["photo"].view(-1, 3, 1, 1, 1).unbind(1)

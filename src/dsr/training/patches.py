@@ -151,7 +151,7 @@ class Patches(Dataset[Batch]):
 class Changes(NamedTuple):
     """How a patch is changed at random."""
 
-    gain: Any  # of each colour channel, (3, 1, 1), or 1
+    gain: Any  # of each colour channel, (3, 1, 1)
     photo: tuple[float, float, float, Any] | None  # its exponent, blur in pixels, and noise: its strength and values
     mirrored: tuple[bool, bool]  # left to right, top to bottom
     turns: int  # quarter turns counterclockwise, after that

@@ -47,10 +47,9 @@ class PatchSettings:
         ranges = {"depth_scale": (0, _MAX_DEPTH_SCALE), "colour": (0, math.inf), "photo": (0, 1),
                   "patch": (_MIN_SIZE, math.inf), "batch": (1, math.inf), "workers": (0, math.inf),
                   "validation_scenes": (0, math.inf)}  # fmt: skip
+        workers = 0 if self.workers == "auto" else self.workers
         for name, (least, most) in ranges.items():
-            value = getattr(self, name)
-            if name == "workers" and value == "auto":
-                continue
+            value = workers if name == "workers" else getattr(self, name)
             if not least <= value <= most or value == math.inf:
                 expected = f"{least} or more" if most == math.inf else f"{least} to {most:g}"
                 raise ValueError(f"{name}: expected {expected}, got {value}")
@@ -60,5 +59,4 @@ class PatchSettings:
         expect_memory("batch", self.batch, _BYTES * self.batch * self.patch**2)
         if self.on_device != "auto" and not isinstance(self.on_device, bool):
             raise ValueError(f"on_device: expected true, false or auto, got {self.on_device}")
-        if self.workers != "auto":
-            expect_memory("workers", self.workers, _BYTES_OF_WORKER * self.workers)
+        expect_memory("workers", workers, _BYTES_OF_WORKER * workers)

@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, ParamSpec, TypeVar
 
 import torch
@@ -70,8 +70,8 @@ def made_once(make: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 @made_once
-def constant(values: Sequence[float], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return numbers, a tuple, as a tensor, (n,)."""
+def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return numbers, (n,), or rows of numbers, as a tensor, which is not to be changed in place."""
     return torch.tensor(values, dtype=dtype, device=device)
 
 

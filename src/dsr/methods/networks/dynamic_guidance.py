@@ -11,7 +11,6 @@ What differs, besides what docs/measurements/methods.md says: the k_l have unit 
 (Roth and Black, IJCV 2009), the data step iterative back-projection (Irani and Peleg 1991), the form of w_l is ours.
 """
 
-import functools
 import math
 from typing import Any
 
@@ -22,6 +21,7 @@ from torch.nn import functional
 from dsr.degradation.downsampling import check_scale
 from dsr.methods.images import box_mean, upsample_linear_border
 from dsr.methods.networks.network import NormalisedNetwork
+from dsr.utils.compute_device import made_once
 
 WIDTHS = tuple(1e-3 * 4**j for j in range(6))  # tau_j, in the unit of the map: from 1/1000 to about 1
 
@@ -30,18 +30,17 @@ _HEIGHT, _CONTRAST, _SHARED, _FIDELITY = 0.05, 2.0, 0.02, 0.5
 _BICUBIC = 2  # half width of the bicubic kernel in low-resolution pixels
 
 
-@functools.cache
+@made_once
 def polynomial_filters(size: int) -> Tensor:
     """Return an orthonormal basis of filters, ordered by degree: 1, u, v, ...; float64 (size^2, size, size).
 
     They are products of two discrete orthogonal (Gram) polynomials; those after the third have response 0 to planes.
     """
-    with torch.inference_mode(mode=False):  # the cached tensors may later be used with gradients
-        x = torch.linspace(-1, 1, size, dtype=torch.float64)
-        q, r = torch.linalg.qr(torch.stack([x**k for k in range(size)], dim=1))
-        one = (q * r.diagonal().sign()).T  # (degree, size)
-        pairs = sorted(((i, j) for i in range(size) for j in range(size)), key=lambda pair: (sum(pair), pair))
-        return torch.stack([one[i][:, None] * one[j] for i, j in pairs])
+    x = torch.linspace(-1, 1, size, dtype=torch.float64)
+    q, r = torch.linalg.qr(torch.stack([x**k for k in range(size)], dim=1))
+    one = (q * r.diagonal().sign()).T  # (degree, size)
+    pairs = sorted(((i, j) for i in range(size) for j in range(size)), key=lambda pair: (sum(pair), pair))
+    return torch.stack([one[i][:, None] * one[j] for i, j in pairs])
 
 
 def influence(z: Tensor, heights: Tensor) -> Tensor:

@@ -103,7 +103,6 @@ class FacetsUNet(DisparityNetwork):
         self.errors = scale_down(nn.Conv2d(HEAD, 2, 3, padding=1))
         self.blend = silence(nn.Conv2d(width, facets * len(_REACHES) * NEIGHBOURS, 3, padding=1))
         self.gate = silence(nn.Conv2d(HEAD, 1, 3, padding=1))
-
         self._project = _project
 
     def compile(self, *arguments: Any, **named: Any) -> None:
