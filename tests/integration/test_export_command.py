@@ -58,7 +58,7 @@ def test_poses_of_a_file_are_those_of_the_exports_whichever_frame_ends_first(cap
     assert [row.split()[3] for row in (rows[1], rows[6])] == ["0", "1"]
     frames = json.loads((out / "transforms.json").read_text())["frames"]
     assert [[row[3] for row in entry["transform_matrix"][:3]] for entry in frames] == [[0, 2, 3], [1, 2, 3]]
-    assert {"cameras.txt", "images.txt", "points3D.txt"} <= names_in(out / "gaussian/sparse/0")
+    assert {"cameras.bin", "images.bin", "points3D.bin"} <= names_in(out / "gaussian/sparse/0")
 
 
 def test_foreign_file_in_place_of_an_export_is_left_alone(capture, tmp_path, capsys):

@@ -1,6 +1,9 @@
 """Frames as other programs read them: axes, units, intrinsics and poses, read back by code of their own."""
 
 import json
+import math
+import struct
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -89,7 +92,9 @@ def read_as_nerfstudio(path, moved, scale):
         pose = moved @ np.array(entry["transform_matrix"])
         pose[:3, 3] *= scale
         photo = cv2.imread(str(folder / entry["file_path"]))
-        assert photo.shape[:2] == depth.shape == (camera["h"], camera["w"])
+        mask = np.array(Image.open(folder / entry["mask_path"]))
+        assert photo.shape[:2] == depth.shape == mask.shape == (camera["h"], camera["w"])
+        np.testing.assert_array_equal(mask.astype(bool), depth > 0)
         numbers = [camera[name] for name in ("fl_x", "fl_y", "cx", "cy")]
         frames.append((Path(entry["file_path"]).name, photo[..., ::-1], depth * scale, numbers, pose))
     cloud = trimesh.load(folder / entries["ply_file_path"])
@@ -106,7 +111,8 @@ def test_transforms_are_read_as_nerfstudio_reads_them(make, tmp_path, second):
     files = write_transforms(path, frames)
     assert {file.relative_to(path.parent).as_posix() for file in files} == {
         "transforms.json", "nerfstudio/points.ply", *(
-            f"nerfstudio/{kind}/room_00{number}.png" for kind in ("images", "depths") for number in (0, 1))
+            f"{kind}/room_00{number}.png" for number in (0, 1)
+            for kind in ("nerfstudio/images", "nerfstudio/depths", "nerfstudio/masks", "normals_from_pretrain"))
     }  # fmt: skip
     moved = np.block([[Rotation.from_rotvec((0.3, -1.2, 0.4)).as_matrix(), np.array([[4.0], [-1], [2]])], [0, 0, 0, 1]])
     read, points, colours = read_as_nerfstudio(path, moved, 0.25)
@@ -161,30 +167,157 @@ def test_splatting_depth_is_inverse_depth_after_scale_and_offset(make, tmp_path)
     assert cv2.imread(str(tmp_path / "g/depths/room_000.png"), cv2.IMREAD_UNCHANGED).max() == 65535
 
 
-def test_splatting_scene_is_a_colmap_model_of_the_same_points(make, tmp_path):
+def test_normals_are_read_as_dn_splatter_reads_them(make, tmp_path):
+    write_transforms(tmp_path / "out" / "transforms.json", [make(0)])
+    entry = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"][0]
+    [path] = (tmp_path / "out" / "normals_from_pretrain").glob("*.png")
+    assert path == tmp_path / "out" / entry["normal_file_path"]
+    read = np.array(Image.open(path))[..., :3] / 255.0
+    normals = (2 * read - 1) * [1, -1, -1]  # from OpenGL's axes to OpenCV's
+    points = CAMERA.rays().numpy() * depth_map()
+    across, down = points[:, 5, 6] - points[:, 5, 5], points[:, 6, 5] - points[:, 5, 5]
+    expected = np.cross(down, across)  # towards the camera
+    np.testing.assert_allclose(normals[5, 5], expected / np.linalg.norm(expected), atol=0.01)
+
+
+def test_frames_without_holes_have_no_masks_and_photos_as_they_are(make, tmp_path):
     frame = make(0)
+    write_depth_file(frame.depth, np.nan_to_num(depth_map(), nan=2.0))
+    write_transforms(tmp_path / "t" / "transforms.json", [frame])
+    assert not (tmp_path / "t" / "nerfstudio" / "masks").exists()
+    assert "mask_path" not in (tmp_path / "t" / "transforms.json").read_text()
+    write_splatting(tmp_path / "g", [frame])
+    assert (tmp_path / "g/images/room_000.png").read_bytes() == frame.colour.read_bytes()
+
+
+def test_photos_for_splatting_are_transparent_in_holes_with_their_colours(make, tmp_path):
+    frame = make(3)
     write_splatting(tmp_path, [frame])
-    sparse = tmp_path / "sparse" / "0"
-    camera = (sparse / "cameras.txt").read_text().splitlines()[1].split()
-    assert camera == ["1", "PINHOLE", "12", "8", "10", "11", "5.75", "4"]
-    image = (sparse / "images.txt").read_text().splitlines()
-    assert image[2] == ""
-    number, *numbers, camera_id, name = image[1].split()
-    assert (number, camera_id, name) == ("1", "1", "room_000.png")
-    w, x, y, z, *shift = map(float, numbers)
+    photo = np.array(Image.open(tmp_path / "images/room_003.png"))
+    np.testing.assert_array_equal(photo[..., 3], np.where(np.isnan(depth_map()), 0, 255))
+    np.testing.assert_array_equal(photo[..., :3], frame.read_colour())
+
+
+def read_colmap(folder):
+    """Return cameras, images and points as ``scene/colmap_loader.py`` of graphdeco's program unpacks them."""
+
+    def unpack(file, form):
+        return struct.unpack("<" + form, file.read(struct.calcsize("<" + form)))
+
+    cameras, images, points = [], [], []
+    with (folder / "cameras.bin").open("rb") as file:
+        for _ in range(*unpack(file, "Q")):
+            cameras.append((*unpack(file, "iiQQ"), *unpack(file, "4d")))
+        assert not file.read()
+    with (folder / "images.bin").open("rb") as file:
+        for _ in range(*unpack(file, "Q")):
+            numbers = unpack(file, "idddddddi")
+            name = b"".join(iter(lambda: file.read(1), b"\0")).decode()
+            images.append((numbers, name, [unpack(file, "ddq") for _ in range(*unpack(file, "Q"))]))
+        assert not file.read()
+    with (folder / "points3D.bin").open("rb") as file:
+        for _ in range(*unpack(file, "Q")):
+            points.append((unpack(file, "QdddBBBd"), [unpack(file, "ii") for _ in range(*unpack(file, "Q"))]))
+        assert not file.read()
+    return cameras, images, points
+
+
+def test_splatting_scene_is_a_colmap_model_of_the_same_points(make, tmp_path):
+    write_splatting(tmp_path, [make(0)])
+    [camera], [(numbers, name, observed)], points = read_colmap(tmp_path / "sparse" / "0")
+    assert camera == (1, 1, 12, 8, 10, 11, 5.75, 4)  # PINHOLE
+    assert (numbers[0], numbers[8], name) == (1, 1, "room_000.png")
+    w, x, y, z, *shift = numbers[1:8]
     turn = np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ])  # fmt: skip
-    points = np.loadtxt(sparse / "points3D.txt")
     assert len(points) == 8 * 12 - 2
-    seen = points[:, 1:4] @ turn.T + shift
+    seen = np.array([point[1:4] for point, _ in points]) @ turn.T + shift
     pixels = seen[:, :2] / seen[:, 2:] * (10, 11) + (5.75, 4)
     rows, columns = np.nonzero(np.isfinite(depth_map()))
     expected = np.stack((columns, rows), axis=1) + 0.5
     np.testing.assert_allclose(pixels, expected, atol=1e-5)
-    assert points[0, 4:7].tolist() == [0, 0, 255]
+    assert points[0][0][4:7] == (0, 0, 255)
+    np.testing.assert_allclose([each[:2] for each in observed], expected, atol=1e-5)
+    assert [each[2] for each in observed] == [point[0] for point, _ in points]
+    assert [track for _, track in points] == [[(1, place)] for place in range(len(points))]
+
+
+def moved(right):
+    """Return a pose beside the origin, by metres."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[0, 3] = right
+    return pose
+
+
+@pytest.fixture
+def walls(make, tmp_path):
+    """Three frames of a wall at 2 m, by cameras beside each other; the first has a floating pixel in the middle."""
+    frames = []
+    for number in range(3):
+        frame, depth = make(number, pose=moved(0.2 * number)), np.full((8, 12), 2, np.float32)
+        if number == 0:
+            depth[4, 8] = 1.0
+        write_depth_file(frame.depth, depth)
+        error = np.full((8, 12), 0.01, np.float32)
+        error[0] = 0.1 if number == 2 else 0.01
+        np.savez(tmp_path / f"{number}.npz", depth_error=error)
+        frames.append(replace(frame, errors=tmp_path / f"{number}.npz"))
+    return frames
+
+
+def test_points_are_those_that_frames_agree_on_and_are_certain_of(walls, tmp_path):
+    write_splatting(tmp_path / "g", walls)
+    _, images, points = read_colmap(tmp_path / "g/sparse/0")
+    places = np.array([point[1:4] for point, _ in points])
+    assert len(places) == 3 * 8 * 12 - 1 - 12  # without the floating pixel, and an uncertain row
+    np.testing.assert_allclose(places[:, 2], 2)
+    for (number, *_), track in points:
+        for image, place in track:
+            assert images[image - 1][2][place][2] == number
+    assert {tuple(image for image, _ in track) for _, track in points} >= {(1,), (1, 2), (1, 2, 3)}
+    write_splatting(tmp_path / "two", walls[:2])  # where one stands against one
+    assert len(read_colmap(tmp_path / "two/sparse/0")[2]) == 2 * 8 * 12
+
+
+def test_colmap_model_is_read_by_colmap(walls, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap", reason="pip install pycolmap")
+    write_splatting(tmp_path, walls)
+    model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    assert sorted(image.name for image in model.images.values()) == [f"room_00{number}.png" for number in range(3)]
+    for point in model.points3D.values():
+        for element in point.track.elements:
+            image = model.images[element.image_id]
+            np.testing.assert_allclose(image.project_point(point.xyz), image.points2D[element.point2D_idx].xy)
+
+
+def test_initial_gaussians_are_discs_on_the_surface(make, tmp_path):
+    frame, depth = make(0), (2 / (1 + CAMERA.rays()[0].numpy())).astype(np.float32)  # the plane x + z = 2
+    write_depth_file(frame.depth, depth)
+    np.savez(tmp_path / "e.npz", depth_error=np.where(np.arange(12) < 6, 0.25, 5e-4) * np.ones((8, 1)))
+    write_splatting(tmp_path, [replace(frame, errors=tmp_path / "e.npz", max_error=1.0)])
+    raw = trimesh.load(tmp_path / "gaussians.ply").metadata["_ply_raw"]["vertex"]
+    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{n}" for n in range(3)), *(f"f_rest_{n}" for n in range(45)),
+             "opacity", *(f"scale_{n}" for n in range(3)), *(f"rot_{n}" for n in range(4))]  # fmt: skip
+    assert list(raw["properties"]) == names
+    values = np.stack([raw["data"][name].ravel() for name in names], axis=1).astype(float)
+    assert values.shape == (96, 62)
+    inward = POSE[:3, :3].numpy() @ [1, 0, 1] / np.sqrt(2)
+    np.testing.assert_allclose(values[:, 3:6], np.tile(-inward, (96, 1)), atol=1e-5)
+    colours = 0.5 + 0.28209479177387814 * values[:, 6:9]
+    np.testing.assert_allclose(colours, frame.read_colour().reshape(-1, 3) / 255, atol=1e-6)
+    assert not values[:, 9:54].any()
+    scales, turns = np.exp(values[:, 55:58]), Rotation.from_quat(values[:, [59, 60, 61, 58]]).as_matrix()
+    np.testing.assert_allclose(turns[:, :, 2], values[:, 3:6], atol=1e-5)
+    # on a small plane through the middle, a pixel's square is as wide as z / f and longer by 1 / cosine
+    middle = 3 * 12 + 5
+    np.testing.assert_allclose(sorted(scales[middle]), [0.1 * 2 / 11, 2 / 11, 2 / 10 * np.sqrt(2)], rtol=0.06)
+    opacity = 1 / (1 + np.exp(-values[:, 54])).reshape(8, 12)
+    np.testing.assert_allclose(opacity[:, 6:], 0.99, atol=1e-6)
+    width = np.sort(scales, axis=1)[:, 1].reshape(8, 12)[3, 2]
+    assert opacity[3, 2] == pytest.approx(math.erf(width / 0.25 / math.sqrt(math.pi)), rel=1e-4)
 
 
 def read_recording(path):

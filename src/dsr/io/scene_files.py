@@ -8,67 +8,27 @@ import importlib
 import json
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import quaternion_of
-from dsr.io.depth_files import read_depth_file
-from dsr.io.exports import as_bytes, world_comment, write_ply
-from dsr.io.images import read_pixels
+from dsr.io.exports import as_bytes, world_comment, write_normals, write_ply
 from dsr.io.photos import encode_png, to_jpeg, write_png
+from dsr.io.posed_frames import Frame, colmap_model, initial_gaussians, sample_points
 from dsr.io.trajectories import check_pose
 from dsr.notes import Assumption
 from dsr.utils.files import replacing, write_text
-from dsr.utils.guards import pixels_beside, refusing
+from dsr.utils.guards import refusing
 from dsr.utils.versions import how_to_install
 
 _Value = TypeVar("_Value")
+NORMALS = "normals_from_pretrain"  # a folder that dn-splatter looks for
 RGBD = ("color.png", "depth.png", "intrinsic.json")
 _MILLIMETRES, _STEPS = 1000, 65535  # of a metre, and of 16 bits
-_POINTS = 100_000  # of all frames together, from which an optimisation starts
-
-
-@dataclass(frozen=True)
-class Frame:
-    """A photo and a depth map of one size."""
-
-    name: str  # perhaps with folders: kitchen/000012
-    camera: Camera
-    pose: Tensor | None  # (4, 4) float64 camera to world in metres; None if it is not known
-    colour: Path  # an 8-bit PNG
-    depth: Path  # a file of (H, W) orthogonal depth in metres, NaN in holes
-    up: str = ""  # the axis of the world that points up, one of dsr.io.frames.UPS
-    time: float | None = None  # in seconds
-
-    @property
-    def stem(self) -> str:
-        """The name as that of a file."""
-        return self.name.replace("/", "_")
-
-    @property
-    def matrix(self) -> np.ndarray:
-        """The pose, (4, 4); a frame without one stands at the origin."""
-        return np.eye(4) if self.pose is None else self.pose.numpy()
-
-    def read_depth(self) -> np.ndarray:
-        """Return the depth, (H, W) float32 in metres, NaN in holes."""
-        values = read_depth_file(self.depth, pixels_beside(self.camera.height, self.camera.width))
-        if values.shape != (self.camera.height, self.camera.width):
-            size = f"{self.camera.height} x {self.camera.width}"
-            raise ValueError(f"{self.depth}: expected depth of {size} pixels (height x width), got {values.shape}")
-        return values.astype(np.float32)
-
-    def read_colour(self) -> np.ndarray:
-        """Return the photo, (H, W, 3) uint8, red first."""
-        most = pixels_beside(self.camera.height, self.camera.width)
-        return read_pixels(self.colour, cv2.IMREAD_COLOR, most)[..., ::-1]
 
 
 def parse_pose(where: str, value: object) -> Tensor | None:
@@ -104,11 +64,19 @@ def expect_poses(part: str, known: Mapping[str, bool]) -> None:
         )
 
 
-def _write_pictures(folder: Path, kinds: tuple[str, str], frame: Frame, values: np.ndarray) -> list[Path]:
-    """Write the photo and values of the depth, (H, W) uint16, of a frame into two folders, and return the files."""
+def _write_pictures(
+    folder: Path, kinds: tuple[str, str], frame: Frame, values: np.ndarray, known: np.ndarray | None = None
+) -> list[Path]:
+    """Write the photo and values of the depth, (H, W) uint16, of a frame into two folders, and return the files.
+
+    ``known``: see :func:`dsr.io.photos.write_png`.
+    """
     photo, depth = (folder / kind / f"{frame.stem}.png" for kind in kinds)
-    with replacing(photo) as temporary:
-        shutil.copyfile(frame.colour, temporary)
+    if known is None or known.all():
+        with replacing(photo) as temporary:
+            shutil.copyfile(frame.colour, temporary)
+    else:
+        write_png(photo, frame.read_colour()[..., ::-1], known)
     write_png(depth, values)
     return [photo, depth]
 
@@ -158,26 +126,37 @@ def _write_intrinsics(path: Path, camera: Camera) -> None:
 
 
 def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
-    """Write ``transforms.json``, and beside it ``nerfstudio/`` with ``images/``, ``depths/`` and ``points.ply``.
+    """Write ``transforms.json``, ``nerfstudio/`` with photos, depth, masks and points, and ``normals_from_pretrain/``.
 
     Its cameras have the axes of OpenGL, x right, y up, z backwards. The world stays as it is, so ``applied_transform``
     is the identity: nerfstudio turns it upright itself, and its versions differ in whether the points of
     ``ply_file_path`` are meant before or after that transform (nerfstudio/data/dataparsers/nerfstudio_dataparser.py).
     Names of files differ, as it finds reduced pictures by the name alone. It takes the unit of depth from its options,
-    millimetres by default; ``depth_unit_scale_factor`` states it for other readers.
+    millimetres by default; ``depth_unit_scale_factor`` states it for other readers. If a frame has holes, each has a
+    mask, as nerfstudio expects one of all frames or of none. dn-splatter finds normals by the folder's name, and reads
+    the colours of :func:`dsr.io.exports.write_normals` (dn_splatter/data/dn_dataset.py, ``omnidata``).
     """
     expect_poses("nerfstudio", {frame.name: frame.pose is not None for frame in frames})
     camera, folder = _common([frame.camera for frame in frames]), path.parent / "nerfstudio"
-    points = folder / "points.ply"
-    write_ply(points, *_sparse(frames), frame=world_comment(_common([frame.up for frame in frames]) or ""))
+    points, sampled = folder / "points.ply", sample_points(frames)
+    up = world_comment(_common([frame.up for frame in frames]) or "")
+    write_ply(points, sampled.places, sampled.colours, frame=up)
+    masked = any(np.isnan(frame.read_depth()).any() for frame in frames)
     files, entries = list[Path](), list[dict[str, Any]]()
     for frame in frames:
-        pictures = _write_pictures(folder, ("images", "depths"), frame, to_millimetres(frame.read_depth())[0])
-        photo, depth = (each.relative_to(path.parent).as_posix() for each in pictures)
-        own = {} if camera is not None else _intrinsics(frame.camera)
+        depth, name = frame.read_depth(), f"{frame.stem}.png"
+        own = _write_pictures(folder, ("images", "depths"), frame, to_millimetres(depth)[0])
+        own.append(path.parent / NORMALS / name)
+        write_normals(own[-1], torch.from_numpy(depth)[None], frame.camera)
+        if masked:
+            own.append(folder / "masks" / name)
+            write_png(own[-1], np.where(np.isnan(depth), 0, 255).astype(np.uint8))
+        keys = "file_path", "depth_file_path", "normal_file_path", "mask_path"
+        entry = {key: each.relative_to(path.parent).as_posix() for key, each in zip(keys, own, strict=False)}
         pose = (frame.matrix * [1, -1, -1, 1]).tolist()
-        entries.append({"file_path": photo, "depth_file_path": depth, **own, "transform_matrix": pose})
-        files += pictures
+        lens = {} if camera is not None else _intrinsics(frame.camera)
+        entries.append({**entry, **lens, "transform_matrix": pose})
+        files += own
     content = {
         "camera_model": "OPENCV",
         **({} if camera is None else _intrinsics(camera)),
@@ -204,13 +183,14 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
 
 
 def write_splatting(folder: Path, frames: Sequence[Frame]) -> list[Path]:
-    """Write ``images/``, ``depths/`` and ``sparse/0/`` of a scene for graphdeco's ``train.py -d depths``.
+    """Write ``images/``, ``depths/``, ``sparse/0/`` and ``gaussians.ply`` for graphdeco's ``train.py -d depths``.
 
     It divides the 16-bit values of ``depths/NAME.png`` by 65536, multiplies them by the ``scale`` of NAME in
     ``sparse/0/depth_params.json`` and compares them with the rendered inverse depth
     (https://github.com/graphdeco-inria/gaussian-splatting, "Depth regularization"). All frames have one scale, as a
-    frame whose scale is far from the others' is left out. The scene is COLMAP's text model
-    (https://colmap.github.io/format.html); a single frame without a pose has none.
+    frame whose scale is far from the others' is left out. Photos are transparent in holes, where it then does not
+    compare colours. The scene is COLMAP's binary model, which it looks for first; a single frame without a pose has
+    none.
     """
     expect_poses("gaussian", {frame.name: frame.pose is not None for frame in frames})
     nearest = min(float(np.fmin.reduce(frame.read_depth(), axis=None, initial=np.inf)) for frame in frames)
@@ -219,54 +199,21 @@ def write_splatting(folder: Path, frames: Sequence[Frame]) -> list[Path]:
     scale = 65536 / _STEPS / nearest
     files = list[Path]()
     for frame in frames:
-        inverse = np.rint(65536 / (scale * frame.read_depth().astype(np.float64)))
-        values = np.nan_to_num(inverse, nan=0, posinf=0).astype(np.uint16)
-        files += _write_pictures(folder, ("images", "depths"), frame, values)
+        depth = frame.read_depth().astype(np.float64)
+        values = np.nan_to_num(np.rint(65536 / (scale * depth)), nan=0, posinf=0).astype(np.uint16)
+        files += _write_pictures(folder, ("images", "depths"), frame, values, np.isfinite(depth))
     parameters = {frame.stem: {"scale": scale, "offset": 0.0} for frame in frames}
-    texts = {"depth_params.json": json.dumps(parameters, indent=2) + "\n"}
+    points, sparse = sample_points(frames), folder / "sparse" / "0"
+    contents = {
+        sparse / "depth_params.json": (json.dumps(parameters, indent=2) + "\n").encode(),
+        folder / "gaussians.ply": initial_gaussians(points),
+    }
     if all(frame.pose is not None for frame in frames):
-        texts |= _colmap_model(frames)
-    for name, text in texts.items():
-        files.append(folder / "sparse" / "0" / name)
-        write_text(files[-1], text)
-    return files
-
-
-def _colmap_model(frames: Sequence[Frame]) -> dict[str, str]:
-    """Return the files of COLMAP's text model: a camera and an image for each frame, and points."""
-    cameras = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"]
-    images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"]
-    points = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]"]
-    for number, frame in enumerate(frames, 1):
-        camera, to_camera = frame.camera, frame.matrix[:3, :3].T
-        values = camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5
-        cameras.append(f"{number} PINHOLE {camera.width} {camera.height} {_numbers(values)}")
-        transform = *quaternion_of(to_camera)[[3, 0, 1, 2]], *(-to_camera @ frame.matrix[:3, 3])
-        images += [f"{number} {_numbers(transform)} {number} {frame.stem}.png", ""]  # an empty line: points it sees
-    for number, (point, (red, green, blue)) in enumerate(zip(*_sparse(frames), strict=True), 1):
-        points.append(f"{number} {_numbers(point)} {red} {green} {blue} 0")
-    lines = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": points}
-    return {name: "\n".join(each) + "\n" for name, each in lines.items()}
-
-
-def _sparse(frames: Sequence[Frame]) -> tuple[np.ndarray, np.ndarray]:
-    """Return points of all frames in the world, (N, 3), and their colours, (N, 3) uint8, on a grid of pixels."""
-    points, colours = [], []
-    for frame in frames:
-        camera, depth = frame.camera, frame.read_depth()
-        step = max(1, int(np.ceil(np.sqrt(depth.size * len(frames) / _POINTS))))
-        rows, columns = (each.ravel() for each in np.mgrid[0 : camera.height : step, 0 : camera.width : step])
-        z = depth[rows, columns].astype(np.float64)
-        rays = np.stack(((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(len(z))), axis=1)
-        pose, known = frame.matrix, np.isfinite(z)
-        points.append((rays * z[:, None])[known] @ pose[:3, :3].T + pose[:3, 3])
-        colours.append(frame.read_colour()[rows, columns][known])
-    return np.concatenate(points), np.concatenate(colours)
-
-
-def _numbers(values: Sequence[float] | np.ndarray) -> str:
-    """Return numbers between blanks."""
-    return " ".join(f"{value:.9g}" for value in values)
+        contents |= {sparse / name: content for name, content in colmap_model(frames, points).items()}
+    for file, content in contents.items():
+        with replacing(file) as temporary:
+            temporary.write_bytes(content)
+    return [*files, *contents]
 
 
 def write_rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:

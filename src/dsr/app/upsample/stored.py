@@ -92,7 +92,6 @@ def read_result(folder: Path, name: str) -> ViewedResult:
     }
     if info["noise"] is not None and is_number(info["noise"].get("deviation")):
         facts["noise of the input"] = f"about {show_length(info['noise']['deviation'], 2)}"
-    limit = info["settings"].get("max_error")
     return ViewedResult(
         name=name,
         depth=depth,
@@ -102,7 +101,7 @@ def read_result(folder: Path, name: str) -> ViewedResult:
         depth_error=depth_error,
         angle_error=angle_error,
         filled=filled,
-        max_error=float(limit) if is_number(limit) and 0 < limit < 1e9 else Results.max_error / 100,
+        max_error=_max_error(info),
         facts=facts,
         notes=notes,
     )
@@ -203,7 +202,16 @@ def read_frame(name: str, folder: Path) -> Frame:
     if not (depth.is_file() and colour.is_file()):
         raise ValueError(f"{folder}: expected {METRES} and rgbd/{RGBD[0]} of this run, one is missing")
     pose, time = parse_pose(f"{folder / INFO}: pose", info.get("pose")), info.get("time")
-    return Frame(name, read_camera(folder, info), pose, colour, depth, info["up"], time if is_number(time) else None)
+    return Frame(
+        name, read_camera(folder, info), pose, colour, depth, info["up"], time if is_number(time) else None,
+        errors=folder / ERRORS if (folder / ERRORS).is_file() else None, max_error=_max_error(info),
+    )  # fmt: skip
+
+
+def _max_error(info: Mapping[str, Any]) -> float:
+    """Return the limit of a result's expected errors, as a fraction of the depth."""
+    limit = info["settings"].get("max_error")
+    return float(limit) if is_number(limit) and 0 < limit < 1e9 else Results.max_error / 100
 
 
 def write_scene(
