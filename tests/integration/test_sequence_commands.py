@@ -235,6 +235,10 @@ def test_fused_mesh_says_its_frame_and_has_the_photos_colours(capture, part, up)
     for places, colour in ((wall, COLOURS[0]), (box, COLOURS[1])):
         expected = colour if part != "depth" else 190
         assert np.abs(np.median(colours[places], axis=0) - expected).max() <= 6
+    assert main(["fuse", str(out), "-o", str(path.with_suffix(".glb")), "--voxel", "0.03"]) == 0
+    same = trimesh.load(path.with_suffix(".glb"), process=False, force="mesh")
+    np.testing.assert_array_equal(same.faces, mesh.faces)
+    np.testing.assert_allclose(same.vertices, vertices if up else vertices * [1, -1, -1], atol=1e-4)
 
 
 def test_results_without_poses_and_damaged_ones_are_refused(capture, capsys):

@@ -194,6 +194,25 @@ def test_glb_mesh_from_near_to_far_has_positions_as_floats(tmp_path):
     assert set(tree["nodes"][0]) == {"mesh"}
 
 
+@pytest.mark.parametrize(
+    ("up", "turn"),
+    [("", np.diag([1, -1, -1])), ("y", np.eye(3)), ("z", np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]))],
+)
+def test_glb_mesh_with_colours_of_points_has_y_up(tmp_path, up, turn):
+    points, corners = np.array([[0, 0, 2.0], [1, 0, 2], [0, 3, 4]]), np.array([[0, 2, 1]])
+    normals, colours = np.tile([0.0, 0.6, 0.8], (3, 1)), np.array([[255, 0, 128], [1, 10, 11], [40, 80, 200]], np.uint8)
+    write_glb(tmp_path / "m.glb", points, normals, corners, colours=colours, up=up)
+    tree, content = glb_parts(tmp_path / "m.glb")
+    assert "images" not in tree
+    linear, _ = attribute(tree, content, "COLOR_0")  # glTF has linear light, photos are sRGB (IEC 61966-2-1)
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    np.testing.assert_array_equal(np.rint(255 * encoded), colours)
+    mesh = trimesh.load(tmp_path / "m.glb", process=False, force="mesh", skip_materials=True)
+    np.testing.assert_allclose(mesh.vertices, points @ turn.T, atol=1e-4)
+    np.testing.assert_allclose(attribute(tree, content, "NORMAL")[0] / 127, normals @ turn.T, atol=0.01)
+    assert np.abs(np.asarray(mesh.visual.vertex_colors)[:, :3] - 255 * linear).max() <= 1
+
+
 def test_map_without_two_neighbours_is_refused_and_an_older_file_is_kept(tmp_path):
     depth = torch.full_like(wall(), torch.nan)
     depth[0, 3, 3] = 2

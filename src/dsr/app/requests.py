@@ -84,10 +84,10 @@ class FuseRequest(Options):
     folders: tuple[Path, ...] = option(..., "folders of results of dsr upsample", "OUT", flags="folders")
     output: Path = option(
         ...,
-        "the mesh, a .ply file",
+        "the mesh, a .ply or .glb file",
         "FILE",
         flags="-o --output",
-        rule=Rule("a file that ends in .ply", lambda path: path.suffix.lower() == ".ply"),
+        rule=Rule("a file that ends in .ply or .glb", lambda path: path.suffix.lower() in (".ply", ".glb")),
         writes="file",
     )
     strict: bool = option(False, "refuse poses that can hardly be right; see docs/checks.md")

@@ -22,9 +22,9 @@ from dsr.app.upsample.stored import (
     read_errors,
     read_result,
 )
-from dsr.geometry.mesh import fuse_maps, suggest_voxel
+from dsr.geometry.mesh import FusedMesh, fuse_maps, suggest_voxel
 from dsr.geometry.poses import PosedMap, as_rigid, check_poses
-from dsr.io.exports import INPUT, read_input, world_comment, write_ply
+from dsr.io.exports import INPUT, read_input, world_comment, write_glb, write_ply
 from dsr.io.images import read_pixels
 from dsr.io.scene_files import RGBD
 from dsr.notes import Assumption, expect_no_warning
@@ -121,13 +121,19 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
         raise ValueError(f"{frames[0]}{' and others' if len(frames) > 1 else ''}: {error}") from error
     colours = _colours(mesh.vertices, frames, max_error, _SEEN * voxel, problems)
     ups = {read_complete(folder)["up"] for folder in frames}
-    comment = world_comment(ups.pop() if len(ups) == 1 else "")
-    write_ply(request.output, mesh.vertices, colours, mesh.normals, mesh.faces, frame=comment)
+    _write(request.output, mesh, colours, ups.pop() if len(ups) == 1 else "")
     size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, voxels of {show_length(voxel)}"
     show(console, f"{_count(frames)} -> {request.output}: {size}; in the world's frame of the poses")
     if request.score:
         show(console, f"successive results differ by {_difference(frames, max_error)} (OPW)")
     return problems
+
+
+def _write(path: Path, mesh: FusedMesh, colours: np.ndarray, up: str) -> None:
+    if path.suffix.lower() == ".glb":
+        write_glb(path, mesh.vertices, mesh.normals, mesh.faces, colours=colours, up=up)
+    else:
+        write_ply(path, mesh.vertices, colours, mesh.normals, mesh.faces, frame=world_comment(up))
 
 
 def _count(results: Sequence[object]) -> str:

@@ -222,7 +222,7 @@ examples:
 examples:
   dsr upsample recording --poses groundtruth.txt --neighbours 4 --only depth,confidence -o out
   dsr fuse out -o mesh.ply
-  dsr fuse out -o mesh.ply --voxel 0.01
+  dsr fuse out -o mesh.glb --voxel 0.01
 """),
     Command("eval", None, "dsr.app.entry:run_eval",
             "Evaluate a method on a data set: predictions, scores, pictures."),

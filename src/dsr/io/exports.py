@@ -33,7 +33,8 @@ CAMERA_FRAME = "camera frame: x right, y down, z forward; metres"
 INPUT = "input.npz"
 LONGEST = 2048  # pixels of the longer side of the stored photo
 _STRIP = 1 << 20  # pixels whose normals are held in memory at a time
-_TO_GLTF = np.array([1, -1, -1])
+# the order and the signs of axes that make y point up, by the axis that does; "" for the camera frame, or not known
+_TO_GLTF = {"": ((0, 1, 2), (1, -1, -1)), "y": ((0, 1, 2), (1, 1, 1)), "z": ((0, 2, 1), (1, 1, -1))}
 _STEPS = 65535
 _FINEST = 4e-4  # of the distance of the nearest point: largest step between positions; the rest has floats
 _LARGEST_TEXTURE = 4096  # pixels of a side, which every viewer supports
@@ -199,18 +200,23 @@ def write_glb(
     points: np.ndarray,
     normals: np.ndarray,
     faces: np.ndarray,
-    places: np.ndarray,
-    photo: np.ndarray,
+    places: np.ndarray | None = None,
+    photo: np.ndarray | None = None,
     filled: np.ndarray | None = None,
+    *,
+    colours: np.ndarray | None = None,
+    up: str = "",
 ) -> None:
-    """Write a mesh, in metres in the camera frame, as binary glTF atomically, with the photo as its texture.
+    """Write a mesh, in metres in a frame with the axis ``up`` or the camera's, as binary glTF atomically.
 
     ``faces``, (M, 3), one at least, are counterclockwise from outside. ``places``, (N, 2), are column and row of each
-    point in the photo, (H, W, 3) uint8. The material is rough and lit from both sides, so that viewers show the shape,
-    too. Positions are rounded to 1/65535 of the longest side of the mesh, half of which is 0.05 mm of a room of 6 m;
-    they are floats if half a step is more than 0.02 % of the nearest point's distance.
+    point in ``photo``, (H, W, 3) uint8, which becomes the texture. Without a photo the points have ``colours``, (N, 3)
+    uint8 (``COLOR_0``, which is linear light). The material is rough and lit from both sides, so that viewers show the
+    shape, too. Positions are rounded to 1/65535 of the longest side of the mesh, half of which is 0.05 mm of a room of
+    6 m; they are floats if half a step is more than 0.02 % of the nearest point's distance.
     """
-    positions, node = points * _TO_GLTF, dict[str, Any]()
+    order, signs = _TO_GLTF[up]
+    positions, node = points[:, order] * signs, dict[str, Any]()
     least, nearest = positions.min(axis=0), float(np.linalg.norm(points, axis=1).min(initial=np.inf))
     step = float((positions.max(axis=0) - least).max()) / _STEPS  # one for all axes, as normals need it
     if 0 < step <= _FINEST * nearest:
@@ -218,22 +224,31 @@ def write_glb(
         node = {"translation": least.tolist(), "scale": [step] * 3}
     else:
         positions = positions.astype(np.float32)
-    attributes = {
-        "POSITION": positions,
-        "NORMAL": np.rint(127 * normals * _TO_GLTF).astype(np.int8),
-        "TEXCOORD_0": ((places + 0.5) / photo.shape[1::-1]).astype(np.float32),
-        **({} if filled is None else {"_FILLED": filled.astype(np.uint8)[:, None]}),
-    }
-    file = _Glb()
+    attributes = {"POSITION": positions, "NORMAL": np.rint(127 * normals[:, order] * signs).astype(np.int8)}
+    file, rough, texture = _Glb(), {"metallicFactor": 0.0, "roughnessFactor": 1.0}, dict[str, Any]()
+    if photo is not None and places is not None:
+        attributes["TEXCOORD_0"] = ((places + 0.5) / photo.shape[1::-1]).astype(np.float32)
+    if colours is not None:
+        light = np.where(colours <= 10, colours / 255 / 12.92, ((colours / 255 + 0.055) / 1.055) ** 2.4)  # of sRGB
+        attributes["COLOR_0"] = light.astype(np.float32)
+    if filled is not None:
+        attributes["_FILLED"] = filled.astype(np.uint8)[:, None]
     primitive = {"attributes": {name: file.add(values, _ATTRIBUTES) for name, values in attributes.items()}}
     bounds = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
     file.accessors[primitive["attributes"]["POSITION"]] |= bounds
     small = np.uint16 if len(points) <= _STEPS else np.uint32  # the last number of a type is none of a point
-    if photo.shape[0] * photo.shape[1] <= _LOSSLESS and max(photo.shape) <= _LARGEST_TEXTURE:
-        kind, picture = "image/png", encode_png(np.ascontiguousarray(photo[..., ::-1]))
-    else:
-        kind, picture = "image/jpeg", to_jpeg(photo, _LARGEST_TEXTURE, _QUALITY)
-    rough = {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    indices = file.add(faces.reshape(-1, 1).astype(small), _INDICES)
+    if photo is not None:
+        if photo.shape[0] * photo.shape[1] <= _LOSSLESS and max(photo.shape) <= _LARGEST_TEXTURE:
+            kind, picture = "image/png", encode_png(np.ascontiguousarray(photo[..., ::-1]))
+        else:
+            kind, picture = "image/jpeg", to_jpeg(photo, _LARGEST_TEXTURE, _QUALITY)
+        rough = {"baseColorTexture": {"index": 0}, **rough}
+        texture = {
+            "textures": [{"source": 0, "sampler": 0}],
+            "samplers": [{"wrapS": 33071, "wrapT": 33071}],
+            "images": [{"mimeType": kind, "bufferView": file.view(picture)}],
+        }
     content = file.packed({
         "asset": {"version": "2.0", "generator": "dsr"},
         "extensionsUsed": ["KHR_mesh_quantization"],
@@ -241,13 +256,9 @@ def write_glb(
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, **node}],
-        "meshes": [{"primitives": [
-            {**primitive, "indices": file.add(faces.reshape(-1, 1).astype(small), _INDICES), "material": 0}
-        ]}],
+        "meshes": [{"primitives": [{**primitive, "indices": indices, "material": 0}]}],
         "materials": [{"pbrMetallicRoughness": rough, "doubleSided": True}],
-        "textures": [{"source": 0, "sampler": 0}],
-        "samplers": [{"wrapS": 33071, "wrapT": 33071}],
-        "images": [{"mimeType": kind, "bufferView": file.view(picture)}],
+        **texture,
     })  # fmt: skip
     with replacing(path) as temporary:
         temporary.write_bytes(content)
