@@ -180,22 +180,17 @@ def test_normals_are_read_as_dn_splatter_reads_them(make, tmp_path):
     np.testing.assert_allclose(normals[5, 5], expected / np.linalg.norm(expected), atol=0.01)
 
 
-def test_frames_without_holes_have_no_masks_and_photos_as_they_are(make, tmp_path):
-    frame = make(0)
-    write_depth_file(frame.depth, np.nan_to_num(depth_map(), nan=2.0))
-    write_transforms(tmp_path / "t" / "transforms.json", [frame])
-    assert not (tmp_path / "t" / "nerfstudio" / "masks").exists()
-    assert "mask_path" not in (tmp_path / "t" / "transforms.json").read_text()
-    write_splatting(tmp_path / "g", [frame])
-    assert (tmp_path / "g/images/room_000.png").read_bytes() == frame.colour.read_bytes()
-
-
-def test_photos_for_splatting_are_transparent_in_holes_with_their_colours(make, tmp_path):
-    frame = make(3)
-    write_splatting(tmp_path, [frame])
-    photo = np.array(Image.open(tmp_path / "images/room_003.png"))
-    np.testing.assert_array_equal(photo[..., 3], np.where(np.isnan(depth_map()), 0, 255))
-    np.testing.assert_array_equal(photo[..., :3], frame.read_colour())
+def test_frames_have_masks_of_their_holes_if_there_are_any(make, tmp_path):
+    frames = [make(0), make(1)]
+    write_depth_file(frames[1].depth, np.nan_to_num(depth_map(1), nan=2.0))
+    write_splatting(tmp_path / "some", frames)
+    for frame in frames:
+        mask = np.array(Image.open(tmp_path / "some" / "masks" / f"{frame.stem}.png"))
+        np.testing.assert_array_equal(mask, np.where(np.isnan(frame.read_depth()), 0, 255))
+    write_splatting(tmp_path / "none", frames[1:])
+    write_transforms(tmp_path / "none" / "transforms.json", frames[1:])
+    assert not list((tmp_path / "none").rglob("masks"))
+    assert "mask_path" not in (tmp_path / "none" / "transforms.json").read_text()
 
 
 def read_colmap(folder):

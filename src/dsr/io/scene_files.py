@@ -65,20 +65,25 @@ def expect_poses(part: str, known: Mapping[str, bool]) -> None:
 
 
 def _write_pictures(
-    folder: Path, kinds: tuple[str, str], frame: Frame, values: np.ndarray, known: np.ndarray | None = None
+    folder: Path, kinds: tuple[str, str], frame: Frame, values: np.ndarray, *, masked: bool = False
 ) -> list[Path]:
     """Write the photo and values of the depth, (H, W) uint16, of a frame into two folders, and return the files.
 
-    ``known``: see :func:`dsr.io.photos.write_png`.
+    ``masked``: write a mask into ``masks/``, too, 255 where there is depth and 0 in holes.
     """
-    photo, depth = (folder / kind / f"{frame.stem}.png" for kind in kinds)
-    if known is None or known.all():
-        with replacing(photo) as temporary:
-            shutil.copyfile(frame.colour, temporary)
-    else:
-        write_png(photo, frame.read_colour()[..., ::-1], known)
+    photo, depth, mask = (folder / kind / f"{frame.stem}.png" for kind in (*kinds, "masks"))
+    with replacing(photo) as temporary:
+        shutil.copyfile(frame.colour, temporary)
     write_png(depth, values)
-    return [photo, depth]
+    if not masked:
+        return [photo, depth]
+    write_png(mask, np.where(np.isnan(frame.read_depth()), 0, 255).astype(np.uint8))
+    return [photo, depth, mask]
+
+
+def _have_holes(frames: Sequence[Frame]) -> bool:
+    """Return whether a frame has holes; programs expect a mask of each frame or of none."""
+    return any(bool(np.isnan(frame.read_depth()).any()) for frame in frames)
 
 
 def write_rgbd(folder: Path, rgb: Tensor, depth: Tensor, camera: Camera) -> list[Assumption]:
@@ -132,31 +137,26 @@ def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
     is the identity: nerfstudio turns it upright itself, and its versions differ in whether the points of
     ``ply_file_path`` are meant before or after that transform (nerfstudio/data/dataparsers/nerfstudio_dataparser.py).
     Names of files differ, as it finds reduced pictures by the name alone. It takes the unit of depth from its options,
-    millimetres by default; ``depth_unit_scale_factor`` states it for other readers. If a frame has holes, each has a
-    mask, as nerfstudio expects one of all frames or of none. dn-splatter finds normals by the folder's name, and reads
-    the colours of :func:`dsr.io.exports.write_normals` (dn_splatter/data/dn_dataset.py, ``omnidata``).
+    millimetres by default; ``depth_unit_scale_factor`` states it for other readers. dn-splatter finds normals by their
+    folder, in the colours of :func:`dsr.io.exports.write_normals` (dn_splatter/data/dn_dataset.py, ``omnidata``).
     """
     expect_poses("nerfstudio", {frame.name: frame.pose is not None for frame in frames})
     camera, folder = _common([frame.camera for frame in frames]), path.parent / "nerfstudio"
     points, sampled = folder / "points.ply", sample_points(frames)
     up = world_comment(_common([frame.up for frame in frames]) or "")
     write_ply(points, sampled.places, sampled.colours, frame=up)
-    masked = any(np.isnan(frame.read_depth()).any() for frame in frames)
-    files, entries = list[Path](), list[dict[str, Any]]()
+    masked, files, entries = _have_holes(frames), list[Path](), list[dict[str, Any]]()
     for frame in frames:
-        depth, name = frame.read_depth(), f"{frame.stem}.png"
-        own = _write_pictures(folder, ("images", "depths"), frame, to_millimetres(depth)[0])
-        own.append(path.parent / NORMALS / name)
-        write_normals(own[-1], torch.from_numpy(depth)[None], frame.camera)
-        if masked:
-            own.append(folder / "masks" / name)
-            write_png(own[-1], np.where(np.isnan(depth), 0, 255).astype(np.uint8))
-        keys = "file_path", "depth_file_path", "normal_file_path", "mask_path"
-        entry = {key: each.relative_to(path.parent).as_posix() for key, each in zip(keys, own, strict=False)}
+        depth, keys = frame.read_depth(), ("file_path", "depth_file_path", "mask_path")
+        own = _write_pictures(folder, ("images", "depths"), frame, to_millimetres(depth)[0], masked=masked)
+        normals = path.parent / NORMALS / own[0].name
+        write_normals(normals, torch.from_numpy(depth)[None], frame.camera)
+        named = {**dict(zip(keys, own, strict=False)), "normal_file_path": normals}
+        entry = {key: each.relative_to(path.parent).as_posix() for key, each in named.items()}
         pose = (frame.matrix * [1, -1, -1, 1]).tolist()
         lens = {} if camera is not None else _intrinsics(frame.camera)
         entries.append({**entry, **lens, "transform_matrix": pose})
-        files += own
+        files += named.values()
     content = {
         "camera_model": "OPENCV",
         **({} if camera is None else _intrinsics(camera)),
@@ -183,25 +183,25 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
 
 
 def write_splatting(folder: Path, frames: Sequence[Frame]) -> list[Path]:
-    """Write ``images/``, ``depths/``, ``sparse/0/`` and ``gaussians.ply`` for graphdeco's ``train.py -d depths``.
+    """Write ``images/``, ``depths/``, ``masks/``, ``sparse/0/`` and ``gaussians.ply`` for graphdeco's ``train.py``.
 
-    It divides the 16-bit values of ``depths/NAME.png`` by 65536, multiplies them by the ``scale`` of NAME in
-    ``sparse/0/depth_params.json`` and compares them with the rendered inverse depth
+    With ``-d depths`` it divides the 16-bit values of ``depths/NAME.png`` by 65536, multiplies them by the ``scale`` of
+    NAME in ``sparse/0/depth_params.json`` and compares them with the rendered inverse depth
     (https://github.com/graphdeco-inria/gaussian-splatting, "Depth regularization"). All frames have one scale, as a
-    frame whose scale is far from the others' is left out. Photos are transparent in holes, where it then does not
-    compare colours. The scene is COLMAP's binary model, which it looks for first; a single frame without a pose has
-    none.
+    frame whose scale is far from the others' is left out. It masks no depth; hierarchical-3d-gaussians of the same
+    authors does, with ``--alpha_masks masks`` (its scene/cameras.py). The scene is COLMAP's binary model, which both
+    look for first; a single frame without a pose has none.
     """
     expect_poses("gaussian", {frame.name: frame.pose is not None for frame in frames})
     nearest = min(float(np.fmin.reduce(frame.read_depth(), axis=None, initial=np.inf)) for frame in frames)
     if not np.isfinite(nearest):
         raise ValueError("gaussian: expected some depth, got holes alone")
     scale = 65536 / _STEPS / nearest
-    files = list[Path]()
+    masked, files = _have_holes(frames), list[Path]()
     for frame in frames:
-        depth = frame.read_depth().astype(np.float64)
-        values = np.nan_to_num(np.rint(65536 / (scale * depth)), nan=0, posinf=0).astype(np.uint16)
-        files += _write_pictures(folder, ("images", "depths"), frame, values, np.isfinite(depth))
+        inverse = np.rint(65536 / (scale * frame.read_depth().astype(np.float64)))
+        values = np.nan_to_num(inverse, nan=0, posinf=0).astype(np.uint16)
+        files += _write_pictures(folder, ("images", "depths"), frame, values, masked=masked)
     parameters = {frame.stem: {"scale": scale, "offset": 0.0} for frame in frames}
     points, sparse = sample_points(frames), folder / "sparse" / "0"
     contents = {
