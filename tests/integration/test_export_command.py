@@ -1,7 +1,10 @@
 """Exports of ``dsr upsample``: what is asked for is written, numbers are said, and refusals write nothing."""
 
 import json
+import struct
 
+import cv2
+import numpy as np
 import pytest
 import trimesh
 from small_frames import write_frames
@@ -59,6 +62,20 @@ def test_poses_of_a_file_are_those_of_the_exports_whichever_frame_ends_first(cap
     frames = json.loads((out / "transforms.json").read_text())["frames"]
     assert [[row[3] for row in entry["transform_matrix"][:3]] for entry in frames] == [[0, 2, 3], [1, 2, 3]]
     assert {"cameras.bin", "images.bin", "points3D.bin"} <= names_in(out / "gaussian/sparse/0")
+
+
+def test_points_for_splatting_are_pixels_that_are_expected_to_be_right(capture, tmp_path):
+    (tmp_path / "poses.txt").write_text("".join(f"{number} 0 0 0 0 0 0 1\n" for number in range(2)))
+    options, out = ("--poses", tmp_path / "poses.txt", "--method", "bicubic", "--max-error", 0.5), tmp_path / "out"
+    assert upsample(capture, *options, "--only", "confidence,gaussian", "-o", out) == 0
+    certain = 0
+    for number in range(2):
+        depth = cv2.imread(str(out / f"{number:03}" / "depth_metres.tiff"), cv2.IMREAD_UNCHANGED)
+        errors = np.load(out / f"{number:03}" / "confidence.npz")["depth_error"].astype(np.float32)
+        certain += int((errors <= 0.005 * depth).sum())
+    assert 0 < certain < 2 * 24 * 32
+    (written,) = struct.unpack("<Q", (out / "gaussian/sparse/0/points3D.bin").read_bytes()[:8])
+    assert written == certain
 
 
 def test_foreign_file_in_place_of_an_export_is_left_alone(capture, tmp_path, capsys):
