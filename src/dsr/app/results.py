@@ -23,7 +23,7 @@ from dsr.app.upsample.stored import (
     read_result,
 )
 from dsr.geometry.mesh import FusedMesh, fuse_maps, suggest_voxel
-from dsr.geometry.poses import PosedMap, as_rigid, check_poses
+from dsr.geometry.poses import PosedMap, as_rigid, check_poses, visible
 from dsr.io.exports import INPUT, read_input, world_comment, write_glb, write_ply
 from dsr.io.images import read_pixels
 from dsr.io.scene_files import RGBD
@@ -187,17 +187,13 @@ def _colours(
         if photo is None:
             continue
         depth, camera, pose, _ = _load(folder, max_error)
-        x, y, z = ((vertices - pose[:3, 3]) @ pose[:3, :3]).T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        inside = (z > 0) & (u > -0.5) & (v > -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
-        places = np.flatnonzero(inside)
-        rows, columns = (np.rint(each[places]).astype(np.intp) for each in (v, u))
-        seen = np.abs(depth[rows, columns] - z[places]) <= near
-        places, rows, columns = places[seen], rows[seen], columns[seen]
+        places, pixels, z = visible(vertices, camera, pose)
+        columns, rows = np.rint(pixels).astype(np.intp).T
+        seen = np.abs(depth[rows, columns] - z) <= near
+        places, rows, columns, z = places[seen], rows[seen], columns[seen], z[seen]
         own = photo[rows * photo.shape[0] // camera.height, columns * photo.shape[1] // camera.width]
-        total[places] += own / z[places, None] ** 2
-        weight[places] += 1 / z[places] ** 2
+        total[places] += own / z[:, None] ** 2
+        weight[places] += 1 / z**2
     known = weight > 0
     total[known] /= weight[known, None]
     return np.where(known[:, None], np.rint(total), _GREY).astype(np.uint8)

@@ -91,6 +91,16 @@ def relative(pose: Matrix, to: Matrix) -> Matrix:
     return invert(to) @ pose
 
 
+def visible(points: np.ndarray, camera: Camera, pose: Matrix) -> tuple[np.ndarray, ...]:
+    """Return which of some points in the world, (N, 3), are in a picture, their places in it, (M, 2), and depths."""
+    x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    inside = (z > 0) & (u > -0.5) & (v > -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
+    found = np.flatnonzero(inside)
+    return found, np.stack((u[found], v[found]), axis=1), z[found]
+
+
 class PosedMap(NamedTuple):
     """A depth map with its camera's place."""
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import quaternion_of
+from dsr.geometry.poses import quaternion_of, visible
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import whole_normals
 from dsr.io.images import read_pixels
@@ -109,19 +109,14 @@ def sample_points(frames: Sequence[Frame]) -> Points:
     agreeing, contradicting = np.zeros((2, len(points.places)), int)
     observed = []
     for frame in frames:
-        camera, pose, depth = frame.camera, frame.matrix, frame.read_certain()
-        x, y, z = ((points.places - pose[:3, 3]) @ pose[:3, :3]).T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        inside = (z > 0) & (u > -0.5) & (v > -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
-        found = np.flatnonzero(inside)
-        rows, columns = (np.rint(each[found]).astype(np.intp) for each in (v, u))
-        gap, limit = depth[rows, columns] - z[found], frame.max_error * z[found]
-        nearest = cv2.erode(np.nan_to_num(depth), np.ones((3, 3)))[rows, columns]  # 0 beside holes
-        contradicting[found[nearest - z[found] > limit]] += 1
-        found = found[np.abs(gap) <= limit]
-        agreeing[found] += 1
-        observed.append((found, np.stack((u, v), axis=1)[found]))
+        depth = frame.read_certain()
+        found, pixels, z = visible(points.places, frame.camera, frame.matrix)
+        columns, rows = np.rint(pixels).astype(np.intp).T
+        limit, nearest = frame.max_error * z, cv2.erode(np.nan_to_num(depth), np.ones((3, 3)))  # 0 beside holes
+        contradicting[found[nearest[rows, columns] - z > limit]] += 1
+        agrees = np.abs(depth[rows, columns] - z) <= limit
+        agreeing[found[agrees]] += 1
+        observed.append((found[agrees], pixels[agrees]))
     kept = agreeing >= contradicting
     number = np.cumsum(kept) - 1
     observed = [(number[found[kept[found]]], pixels[kept[found]]) for found, pixels in observed]
