@@ -225,7 +225,8 @@ def write_glb(
     else:
         positions = positions.astype(np.float32)
     attributes = {"POSITION": positions, "NORMAL": np.rint(127 * normals[:, order] * signs).astype(np.int8)}
-    file, rough, texture = _Glb(), {"metallicFactor": 0.0, "roughnessFactor": 1.0}, dict[str, Any]()
+    file, texture = _Glb(), dict[str, Any]()
+    rough: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
     if photo is not None and places is not None:
         attributes["TEXCOORD_0"] = ((places + 0.5) / photo.shape[1::-1]).astype(np.float32)
     if colours is not None:

@@ -96,18 +96,20 @@ class Points(NamedTuple):
     axes: np.ndarray  # (N, 3, 3) rotations: columns along the piece, across it, and the normal towards the camera
     sizes: np.ndarray  # (N, 2) of the piece along the first two axes in metres
     errors: np.ndarray  # (N,) expected error of the depth in metres, NaN if it is not known
-    observed: Sequence[tuple[np.ndarray, np.ndarray]] = ()  # of each frame: numbers of points, and their columns, rows
 
 
-def sample_points(frames: Sequence[Frame]) -> Points:
-    """Return certain pixels on a grid in each frame, except for those that other frames contradict.
+Observed = list[tuple[np.ndarray, np.ndarray]]  # of each frame: numbers of points, (M,), and their pixels, (M, 2)
+
+
+def sample_points(frames: Sequence[Frame]) -> tuple[Points, Observed]:
+    """Return certain pixels on a grid in each frame, except for those that other frames contradict, and who sees them.
 
     A frame agrees with a point if its depth there differs by at most ``max_error``, and contradicts it if it sees
     farther all around. A point needs as many frames that agree, its own included, as contradict.
     """
     points = Points(*map(np.concatenate, zip(*(_sample(frame, len(frames)) for frame in frames), strict=True)))
     agreeing, contradicting = np.zeros((2, len(points.places)), int)
-    observed = []
+    observed: Observed = []
     for frame in frames:
         depth = frame.read_certain()
         found, pixels, z = visible(points.places, frame.camera, frame.matrix)
@@ -120,11 +122,11 @@ def sample_points(frames: Sequence[Frame]) -> Points:
     kept = agreeing >= contradicting
     number = np.cumsum(kept) - 1
     observed = [(number[found[kept[found]]], pixels[kept[found]]) for found, pixels in observed]
-    return Points(*(each[kept] for each in points[:5]), observed)
+    return Points(*(each[kept] for each in points)), observed
 
 
-def _sample(frame: Frame, count: int) -> tuple[np.ndarray, ...]:
-    """Return the points of one of several frames, without ``observed``."""
+def _sample(frame: Frame, count: int) -> Points:
+    """Return the points of one of several frames."""
     camera, depth, pose = frame.camera, frame.read_certain(), frame.matrix
     step = max(1, int(np.ceil(np.sqrt(depth.size * count / _MOST))))
     at = np.s_[::step, ::step]
@@ -143,14 +145,14 @@ def _sample(frame: Frame, count: int) -> tuple[np.ndarray, ...]:
     sizes[:, 0] = np.minimum(sizes[:, 0], _LONGEST * sizes[:, 1])
     errors = np.full(depth.shape, np.nan) if (stated := frame.read_errors()) is None else stated
     places = (rays * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
-    return places, frame.read_colour()[at][known], pose[:3, :3] @ axes, sizes, errors[at][known]
+    return Points(places, frame.read_colour()[at][known], pose[:3, :3] @ axes, sizes, errors[at][known])
 
 
-def colmap_model(frames: Sequence[Frame], points: Points) -> dict[str, bytes]:
+def colmap_model(frames: Sequence[Frame], points: Points, observed: Observed) -> dict[str, bytes]:
     """Return the files of COLMAP's binary model: a camera and an image for each frame, and points with tracks."""
     cameras, images = [struct.pack("<Q", len(frames))], [struct.pack("<Q", len(frames))]
     sights = []
-    for number, (frame, (seen, pixels)) in enumerate(zip(frames, points.observed, strict=True), 1):
+    for number, (frame, (seen, pixels)) in enumerate(zip(frames, observed, strict=True), 1):
         camera, to_camera = frame.camera, frame.matrix[:3, :3].T
         lens = camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5
         cameras.append(struct.pack("<IiQQ4d", number, _PINHOLE, camera.width, camera.height, *lens))

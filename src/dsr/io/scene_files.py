@@ -142,7 +142,7 @@ def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
     """
     expect_poses("nerfstudio", {frame.name: frame.pose is not None for frame in frames})
     camera, folder = _common([frame.camera for frame in frames]), path.parent / "nerfstudio"
-    points, sampled = folder / "points.ply", sample_points(frames)
+    points, (sampled, _) = folder / "points.ply", sample_points(frames)
     up = world_comment(_common([frame.up for frame in frames]) or "")
     write_ply(points, sampled.places, sampled.colours, frame=up)
     masked, files, entries = _have_holes(frames), list[Path](), list[dict[str, Any]]()
@@ -203,13 +203,13 @@ def write_splatting(folder: Path, frames: Sequence[Frame]) -> list[Path]:
         values = np.nan_to_num(inverse, nan=0, posinf=0).astype(np.uint16)
         files += _write_pictures(folder, ("images", "depths"), frame, values, masked=masked)
     parameters = {frame.stem: {"scale": scale, "offset": 0.0} for frame in frames}
-    points, sparse = sample_points(frames), folder / "sparse" / "0"
+    (points, observed), sparse = sample_points(frames), folder / "sparse" / "0"
     contents = {
         sparse / "depth_params.json": (json.dumps(parameters, indent=2) + "\n").encode(),
         folder / "gaussians.ply": initial_gaussians(points),
     }
     if all(frame.pose is not None for frame in frames):
-        contents |= {sparse / name: content for name, content in colmap_model(frames, points).items()}
+        contents |= {sparse / name: content for name, content in colmap_model(frames, points, observed).items()}
     for file, content in contents.items():
         with replacing(file) as temporary:
             temporary.write_bytes(content)
