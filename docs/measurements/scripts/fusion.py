@@ -1,8 +1,8 @@
 # Frozen: this measured once what the documentation says of it. It is not maintained.
 """How near the fused mesh of a sequence comes to the surface: F-score, accuracy and completeness, by what is fused.
 
-    python docs/measurements/scripts/fusion.py [--size 192] [--scale 4] [--noise kinect] [--procedural 3]
-                                   [--step 0.03]
+    python docs/measurements/scripts/fusion.py [--size 192] [--scale 4] [--noise kinect] [--solids 4]
+                                                [--procedural 0] [--step 0.1] [--points DIR]
 
 On SimGeo's solids and on procedural scenes, rendered from the seven places of ``sequences.py`` with the noise of a
 simulated sensor and exact poses. The ground truth is the points of all true depth maps at twice the size. Accuracy is the mean distance
@@ -14,19 +14,28 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from statistics import mean
 
+import cv2
 import numpy as np
 import torch
 import trimesh
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 import sequences
 from sequences import NOISES, SOLIDS, Frame, rendered, solids, window
 
+
+from dsr.app.upsample.stored import find_results, read_frame
+from dsr.cli import main as dsr
+from dsr.degradation.noise import Noise
 from dsr.geometry.mesh import fuse_maps, suggest_voxel
 from dsr.geometry.poses import PosedMap
 from dsr.inference import upsample_surface
 from dsr.inference.sequences import fuse_views
+from dsr.io.posed_frames import _sample, sample_points
 from dsr.methods.base import Surface
 
 LIMITS = (0.05, 0.01, 0.005)
@@ -88,20 +97,55 @@ def measure(make: Callable[..., list[Frame]], scene: str | int, size: int, *more
     return found
 
 
+def measure_points(folder: Path, noise: Noise) -> None:
+    """Write a sequence and its export into a folder, and print how far points of the export are from the surface."""
+    frames, rows = solids("cube_high_freq", 256, 4, noise), []
+    camera = frames[0].camera
+    for number, frame in enumerate(frames):
+        depth = frame.depth_lr[0].numpy().copy()
+        depth[20:34, 40:56] = np.nan
+        pictures = {"rgb": 255 * frame.rgb.permute(1, 2, 0).numpy()[..., ::-1], "depth": np.nan_to_num(1000 * depth)}
+        for kind, values in pictures.items():
+            (folder / kind).mkdir(parents=True, exist_ok=True)
+            values = values.round().astype(np.uint8 if kind == "rgb" else np.uint16)
+            cv2.imwrite(str(folder / kind / f"{number:03}.png"), values)
+        turn = Rotation.from_matrix(frame.pose[:3, :3]).as_quat()
+        rows.append(" ".join(map(str, (number, *frame.pose[:3, 3], *turn))))
+    (folder / "poses.txt").write_text("\n".join(rows) + "\n")
+    lens = map(str, (camera.fx, camera.fy, camera.cx, camera.cy))
+    out = folder / "out"
+    dsr(["upsample", str(folder), "--poses", str(folder / "poses.txt"), "--intrinsics", *lens, "-o", str(out),
+         "--only", "confidence,gaussian,nerfstudio"])  # fmt: skip
+    tree = cKDTree(truth_of(solids("cube_high_freq", 512, 4, noise)))
+    exported = [read_frame(each.name, each) for each in find_results(out)]
+    for name, given in {"all": [replace(each, errors=None) for each in exported], "certain": exported}.items():
+        alone = np.concatenate([_sample(each, len(given)).places for each in given])
+        for way, places in {name: alone, f"{name}, frames agree": sample_points(given)[0].places}.items():
+            far = tree.query(places)[0]
+            shares = (f"{100 * float((far > limit).mean()):.2f} % beyond {limit} m" for limit in (0.02, 0.05))
+            print(f"{way:22s} {len(places)} points, mean {1e3 * far.mean():.2f} mm,", *shares)
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=192)
     parser.add_argument("--scale", type=int, default=4)
     parser.add_argument("--noise", choices=NOISES, default="kinect")
-    parser.add_argument("--procedural", type=int, default=3, help="number of procedural scenes")
-    parser.add_argument("--step", type=float, default=sequences.STEP, help="between places, see sequences.py")
+    parser.add_argument("--solids", type=int, default=4, help="number of SimGeo's solids")
+    parser.add_argument("--procedural", type=int, default=0, help="number of procedural scenes")
+    parser.add_argument("--step", type=float, default=0.1, help="between places, see sequences.py")
+    parser.add_argument("--points", type=Path, help="a folder for an export whose points are measured, and nothing else")
     arguments = parser.parse_args()
     sequences.STEP = arguments.step
     torch.set_num_threads(1)
+    if arguments.points:
+        sequences.STEP = 0.03
+        measure_points(arguments.points, NOISES[arguments.noise]())
+        return
     given = arguments.size, arguments.scale, NOISES[arguments.noise]()
     groups = {
-        "SimGeo's solids": [measure(solids, name, *given) for name in SOLIDS],
+        "SimGeo's solids": [measure(solids, name, *given) for name in SOLIDS[: arguments.solids]],
         "procedural scenes": [measure(rendered, index, *given) for index in range(arguments.procedural)],
     }
     for group, found in groups.items():
