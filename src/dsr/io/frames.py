@@ -101,6 +101,12 @@ def stated(read: Callable[_Arguments, Geometry], *args: _Arguments.args, **kwarg
         return Geometry(damage=str(error))
 
 
+def accuracy_notes(*, absolute: bool, stated: bool) -> list[Assumption]:
+    """Return a note on depth that a photo's file does not state to be absolute, if it states anything."""
+    known = "is relative, as the file states" if stated else "may be relative, the file does not say"
+    return [] if absolute else [Assumption(f"the depth {known}: sizes and distances mean little")]
+
+
 @dataclass(frozen=True)
 class CaptureFrame:
     """What a capture states of one frame.

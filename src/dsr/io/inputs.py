@@ -418,6 +418,8 @@ def _range_type(pair: Pair, reading: Reading, described: CameraFile) -> tuple[Ra
     if _is_icl(pair):
         text = "values are distances along the rays in centimetres, as in ICL-NUIM's .depth"
         return "perspective", [Assumption(text)]
+    if pair.along_ray:
+        return "perspective", [Assumption("values are distances along the rays, as the file states")]
     if described.range_type in (None, "orthogonal"):
         return described.range_type, []
     return described.range_type, [Assumption(f"values are of range type {described.range_type}, by the camera file")]

@@ -169,6 +169,7 @@ class Pair:
     confidence: ConfidenceMap | None = field(default=None, compare=False)
     bits: int = 0  # how far the layout turns values of 16 bits to the left; the unit holds after turning them back
     time: float | None = None  # of the photo in seconds, if the capture or a list of the files states it
+    along_ray: bool = False  # whether the layout's values are distances along the rays
 
     @property
     def named_time(self) -> float | None:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dsr.io.frames import CaptureFrame, Geometry, Size, Source
+from dsr.io.frames import CaptureFrame, Geometry, Size, Source, accuracy_notes
 from dsr.io.pairs import Pair, PairingResult
 from dsr.io.photos import decode_heic, open_heic, read_heic, same_aspect, turned_in_heic
 from dsr.io.trajectories import intrinsics_camera
@@ -68,14 +68,12 @@ def _geometry(path: Path, xmp: bytes, size: Size) -> Geometry:
     """Return the camera of a photo of (height, width)."""
     text = xmp.decode(errors="replace")
     accuracy = re.search(r"depthData:Accuracy\W{1,3}(\w+)", text)
-    notes = []
-    if accuracy is None or accuracy[1] != "absolute":
-        known = "is relative, as the file states" if accuracy else "may be relative, the file does not say"
-        notes.append(Assumption(f"the depth {known}: sizes and distances mean little"))
+    absolute = accuracy is not None and accuracy[1] == "absolute"
+    notes = tuple(accuracy_notes(absolute=absolute, stated=accuracy is not None))
     matrix = re.search(r"depthData:IntrinsicMatrix>(.*?)</depthData:IntrinsicMatrix>", text, re.DOTALL)
     sides = dict(re.findall(r"depthData:IntrinsicMatrixReference(Width|Height)\W{1,3}(\d{1,6})\b", text))
     if matrix is None or len(sides) < 2:
-        return Geometry(None, None, tuple(notes))
+        return Geometry(None, None, notes)
     values = numbers_in(re.findall(r"<rdf:li>\s*([^<\s]*)\s*</rdf:li>", matrix[1]))
     width, height = int(sides["Width"]), int(sides["Height"])
     if len(values) != 9 or min(width, height) < 1:
@@ -95,4 +93,4 @@ def _geometry(path: Path, xmp: bytes, size: Size) -> Geometry:
             f"{turned[0]} for {size[1]} x {size[0]} pixels (width x height)"
         )
     camera = intrinsics_camera(f"{path}: depthData:IntrinsicMatrix", turned, (fx, fy, cx, cy))
-    return Geometry(camera, None, tuple(notes))
+    return Geometry(camera, None, notes)
