@@ -707,7 +707,15 @@ def with_xmp(photo, standard, extended="", swap=False):
 
 def gdepth(path, levels, *, confidence=None, original=None, extended=True, swap=False, photo=None, **values):
     """Write a JPEG with GDepth: near and far are 0.5 and 4 m unless ``values`` say else, empty ones are left out."""
-    keys = {"Format": "RangeInverse", "Near": 0.5, "Far": 4.0, "Units": "m", "Mime": "image/png", **values}
+    keys = {
+        "Format": "RangeInverse",
+        "Near": 0.5,
+        "Far": 4.0,
+        "Units": "m",
+        "Mime": "image/png",
+        "ImageWidth": 256,
+        **values,
+    }
     data = {"GDepth:Data": encoded(levels)}
     data |= {} if confidence is None else {"GDepth:Confidence": encoded(confidence)}
     data |= {} if original is None else {"GImage:Data": original}

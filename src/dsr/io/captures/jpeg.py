@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BufferedReader, BytesIO
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -30,28 +29,19 @@ from dsr.utils.guards import MOST_FILE, expect_bytes, expect_one_of, naming, num
 _START, _APP1, _SCAN, _END = b"\xff\xd8", 0xE1, 0xDA, b"\xff\xd9"  # markers of JPEG (ITU-T T.81, B.1)
 _MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # in and behind entropy-coded data
 _XMP, _EXTENDED = b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0"
-_NAMESPACE = re.compile(rb"http://ns\.google\.com/photos/(dd/)?1\.0/depthmap/")
 _MOST_XMP = 1 << 26  # bytes
+_NAMESPACE = re.compile(rb"http://ns\.google\.com/photos/(dd/)?1\.0/depthmap/")
 # an attribute or an element with text; Google Photos writes Item_1_ for Item in a file with two directories
 _PROPERTY = re.compile(
     r"""\b(GDepth|GImage|Item|Image|DepthMap|ImagingModel)(?:_\d_)?:(\w+)\s*(?:=\s*"([^"]*)"|=\s*'([^']*)'|>([^<>]*)<)"""
 )
-_METRES = {"m": 1.0, "meters": 1.0, "mm": 1e-3}
+_MODEL = {f"ImagingModel:{name}": default for name, default in (
+    ("FocalLengthX", ""), ("FocalLengthY", ""), ("ImageWidth", ""), ("ImageHeight", ""),
+    ("PrincipalPointX", "0.5"), ("PrincipalPointY", "0.5"),
+)}  # fmt: skip
+_METRES = {"m": 1.0, "meters": 1.0, "mm": 1e-3, "diopters": 1.0}
 _NO_CONFIDENCE = 0.02  # a JPEG does not keep zeros
-
-
-class _Content(NamedTuple):
-    """Encoded pictures, empty where there is none, and the properties of the depth map and of its camera by name."""
-
-    photo: bytes
-    depth: bytes
-    confidence: bytes
-    values: dict[str, str]
-    camera: dict[str, str]
-
-    def value(self, name: str) -> str:
-        """Return a property of the depth map in lower case."""
-        return self.values.get(name, "").lower()
+_Values = dict[str, str]  # properties by their names
 
 
 @dataclass(frozen=True)
@@ -60,27 +50,26 @@ class _JpegImage(Source):
 
     def read(self) -> np.ndarray:
         """Return (H, W, 3) uint8 RGB, (h, w) float32 depth in metres, NaN in holes, or confidence from 0 to 1."""
-        content = _read(self.file)
+        pictures, values = _read(self.file)
         if self.name == "photo":
             with naming(self.file):
-                return decode_photo(content.photo)
+                return decode_photo(pictures["photo"])
+        share = self._grey(pictures[self.name])
         if self.name == "confidence":
-            return self._grey(content.confidence)
-        near, far = (next(iter(numbers_in([content.value(name)])), 0.0) for name in ("Near", "Far"))
+            return share
+        near, far = (next(iter(numbers_in([values.get(name, "")])), 0.0) for name in ("Near", "Far"))
         if not (0 < near < np.inf and 0 < far < np.inf):
-            got = f"{content.value('Near')!r:.40}, {content.value('Far')!r:.40}"
+            got = f"{values.get('Near')!r:.40}, {values.get('Far')!r:.40}"
             raise ValueError(f"{self.file}: Near, Far: expected positive numbers, got {got}")
-        kind, share = content.value("Format") or "rangeinverse", self._grey(content.depth)
+        kind, unit = values.get("Format", "RangeInverse").lower(), values.get("Units", "").lower()
         expect_one_of(f"{self.file}: Format", kind, ("rangeinverse", "rangelinear"))
-        unit = content.value("Units")
         with np.errstate(all="ignore"):  # of ranges that are no distances
-            inverse = kind == "rangeinverse"
-            depth = 1 / (1 / near + share * (1 / far - 1 / near)) if inverse else near + share * (far - near)
+            inverse = 1 / near + share * (1 / far - 1 / near)
+            depth = 1 / inverse if kind == "rangeinverse" else near + share * (far - near)
             depth = (1 / depth if unit == "diopters" else depth * _METRES.get(unit, 1.0)).astype(np.float32)
-        if content.confidence:
-            confidence = self._grey(content.confidence)
-            if confidence.shape == depth.shape:  # what else is refused when it is read
-                depth[confidence < _NO_CONFIDENCE] = np.nan  # where Android writes near
+        confidence = self._grey(pictures["confidence"]) if pictures["confidence"] else depth
+        if confidence.shape == depth.shape:  # another size is refused when confidence is read
+            depth[confidence < _NO_CONFIDENCE] = np.nan  # where Android writes near
         return depth
 
     def _grey(self, content: bytes) -> np.ndarray:
@@ -94,15 +83,16 @@ class _JpegImage(Source):
 
 def read(path: Path) -> PairingResult:
     """Return the pair of a JPEG with a depth map."""
-    content = _read(path)
-    unit, ray = content.value("Units"), content.value("MeasureType") == "opticray"
-    notes = accuracy_notes(absolute=unit in (*_METRES, "diopters"), stated=bool(unit))
+    pictures, values = _read(path)
+    unit, ray = values.get("Units", "").lower(), values.get("MeasureType", "").lower() == "opticray"
+    notes = accuracy_notes(absolute=unit in _METRES, stated=bool(unit))
     notes += [AS_STORED] if read_exif(path).orientation != 1 else []
-    geometry = stated(_geometry, path, content.camera, tuple(notes))
-    sources = _JpegImage(path, "photo"), _JpegImage(path, "depth")
-    frame = CaptureFrame("JPEG", geometry, path, repr(content.camera).encode(), *sources)
-    confidence = ConfidenceMap(path, 1.0, _JpegImage(path, "confidence")) if content.confidence else None
-    pair = Pair(path.stem, path, path / "depth", unit=1.0, capture=frame, confidence=confidence, along_ray=ray)
+    model = {name: values[name] for name in _MODEL if name in values}
+    geometry = stated(_geometry, path, model, tuple(notes))
+    photo, depth, confidence = (_JpegImage(path, name) for name in pictures)
+    frame = CaptureFrame("JPEG", geometry, path, repr(model).encode(), photo, depth)
+    sure = ConfidenceMap(path, 1.0, confidence) if pictures["confidence"] else None
+    pair = Pair(path.stem, path, path / "depth", unit=1.0, capture=frame, confidence=sure, along_ray=ray)
     return PairingResult((pair,), (Assumption("JPEG photos with depth maps of their own"),))
 
 
@@ -114,24 +104,22 @@ def has_depth(path: Path) -> bool:
 
 def _segments(file: BufferedReader) -> Iterator[bytes]:
     """Yield the APP1 segments of a JPEG; at the end the file is four bytes behind the beginning of its first scan."""
-    file.seek(0)
     head = b"\xff" if file.read(2) == _START else b""
     while head[:1] == b"\xff" and len(head := file.read(4)) == 4 and head[1] != _SCAN:
-        size = int.from_bytes(head[2:]) - 2
+        size = max(int.from_bytes(head[2:]) - 2, 0)
         if head[1] == _APP1:
-            yield file.read(max(size, 0))
+            yield file.read(size)
         else:
-            file.seek(max(size, 0), 1)
+            file.seek(size, 1)
 
 
-def _read(path: Path) -> _Content:
-    """Return what a JPEG with a depth map has."""
+def _read(path: Path) -> tuple[dict[str, bytes], _Values]:
+    """Return the encoded photo, depth map and confidence, and the properties of map and camera."""
     with opened(path) as file:
         expect_bytes(path, path.stat().st_size, MOST_FILE)
-        segments = list(_segments(file))
-        start = max(file.tell() - 4, 0)
+        segments, place = list(_segments(file)), max(file.tell() - 4, 0)
         file.seek(0)
-        photo = file.read()
+        content = file.read()
     expect_bytes(f"{path}: XMP", sum(map(len, segments)), _MOST_XMP)
     xmp = b"".join(each.removeprefix(_XMP) for each in segments if each.startswith(_XMP))
     parts = [each.removeprefix(_EXTENDED) for each in segments if each.startswith(_EXTENDED)]
@@ -142,38 +130,43 @@ def _read(path: Path) -> _Content:
     lists = (xmp + extended).decode("latin-1").split("<rdf:li")
     groups = [{f"{m[1]}:{m[2]}": m[3] or m[4] or m[5] or "" for m in _PROPERTY.finditer(each)} for each in lists]
     found = {name: value for group in groups for name, value in group.items()}
+    camera = next((group for group in groups if "DepthMap:DepthURI" in group), {})
     if "GDepth:Data" in found:
-        original, depth, confidence = (
-            _decoded(path, name, found.get(name, "")) for name in ("GImage:Data", "GDepth:Data", "GDepth:Confidence")
+        camera, names = found, ("GImage:Data", "GDepth:Data", "GDepth:Confidence")
+        original, depth, confidence = (_decoded(path, name, found.get(name, "")) for name in names)
+    elif camera:
+        files, names = (
+            _files(path, content, place, groups),
+            ("Image:ItemURI", "DepthMap:DepthURI", "DepthMap:ConfidenceURI"),
         )
-        return _Content(_same_size(photo, original), depth, confidence, _named(found, "GDepth:"), {})
-    camera = next((group for group in groups if "DepthMap:DepthURI" in group), None)
-    if camera is None:
+        original, depth, confidence = (files.get(camera.get(name, ""), b"") for name in names)
+    else:
         raise ValueError(f"{path}: expected GDepth:Data or DepthMap:DepthURI in the XMP, there is neither")
-    items, place = dict[str, bytes](), _end(photo, start)
+    if original and picture_size(BytesIO(original)) == picture_size(BytesIO(content)):  # the photo before effects
+        content = original
+    values = {
+        name.partition(":")[2]: value for name, value in camera.items() if not name.startswith(("GImage", "Item"))
+    }
+    return {"photo": content, "depth": depth, "confidence": confidence}, values
+
+
+def _files(path: Path, content: bytes, place: int, groups: list[_Values]) -> dict[str, bytes]:
+    """Return the files behind a JPEG, of which a scan begins at a place, by their addresses in its directory."""
+    end = len(content)
+    while marker := _MARKER.search(content, place):
+        place = end = marker.end()
+        if marker[0] == _END:
+            break
+        place += int.from_bytes(content[place : place + 2])
+    files = dict[str, bytes]()
     for number, item in enumerate(each for each in groups if "Item:Mime" in each):
         sizes = [item.get(name) or "0" for name in ("Item:Length", "Item:Padding")]
         if not all(re.fullmatch(r"\d{1,12}", each, re.ASCII) for each in sizes):
             raise ValueError(f"{path}: Item:Length, Item:Padding: expected bytes, got {', '.join(sizes)!r:.60}")
-        length, padding = map(int, sizes)
-        length = length if number else 0  # the first one is the photo
-        items[item.get("Item:DataURI", "")] = photo[place : place + length]
-        place += length + padding
-    original, depth, confidence = (
-        items.get(camera.get(name, ""), b"")
-        for name in ("Image:ItemURI", "DepthMap:DepthURI", "DepthMap:ConfidenceURI")
-    )
-    model = _named(camera, "ImagingModel:")
-    return _Content(_same_size(photo, original), depth, confidence, _named(camera, "DepthMap:"), model)
-
-
-def _end(content: bytes, place: int) -> int:
-    """Return where a JPEG ends, of which a scan begins at a place."""
-    while marker := _MARKER.search(content, place):
-        if marker[0] == _END:
-            return marker.end()
-        place = marker.end() + int.from_bytes(content[marker.end() : marker.end() + 2])
-    return len(content)
+        length = int(sizes[0]) if number else 0  # the first one is the photo
+        files[item.get("Item:DataURI", "")] = content[end : end + length]
+        end += length + int(sizes[1])
+    return files
 
 
 def _decoded(path: Path, name: str, text: str) -> bytes:
@@ -182,24 +175,13 @@ def _decoded(path: Path, name: str, text: str) -> bytes:
         return base64.b64decode(re.sub(r"&#\w+;|\s", "", text) + "==")
 
 
-def _same_size(photo: bytes, original: bytes) -> bytes:
-    """Return the photo before effects, which may be empty, if it has the size of the one that is shown."""
-    return original if original and picture_size(BytesIO(original)) == picture_size(BytesIO(photo)) else photo
-
-
-def _named(found: dict[str, str], prefix: str) -> dict[str, str]:
-    return {name.removeprefix(prefix): value for name, value in found.items() if name.startswith(prefix)}
-
-
-def _geometry(path: Path, camera: dict[str, str], notes: tuple[Assumption, ...]) -> Geometry:
+def _geometry(path: Path, model: _Values, notes: tuple[Assumption, ...]) -> Geometry:
     """Return the camera of an imaging model, in pixels, but for the principal point, a share of the photo or pixels."""
-    if not camera:
+    if not model:
         return Geometry(None, None, notes)
-    defaults = {"FocalLengthX": "", "FocalLengthY": "", "ImageWidth": "", "ImageHeight": "",
-                "PrincipalPointX": "0.5", "PrincipalPointY": "0.5"}  # fmt: skip
-    numbers = numbers_in(camera.get(name, default) for name, default in defaults.items())
-    if len(numbers) != len(defaults) or not all(1 <= each <= MOST_FILE for each in numbers[2:4]):
-        raise ValueError(f"{path}: ImagingModel: expected focal lengths and the size of the photo, got {camera!s:.200}")
+    numbers = numbers_in((_MODEL | model).values())
+    if len(numbers) != len(_MODEL) or not all(1 <= each <= MOST_FILE for each in numbers[2:4]):
+        raise ValueError(f"{path}: ImagingModel: expected focal lengths and the size of the photo, got {model!s:.200}")
     fx, fy, width, height, cx, cy = numbers
     if max(cx, cy) <= 1:
         cx, cy = cx * width - 0.5, cy * height - 0.5
