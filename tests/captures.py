@@ -705,28 +705,18 @@ def with_xmp(photo, standard, extended="", swap=False):
     return photo[:2] + b"".join(b"\xff\xe1" + struct.pack(">H", len(each) + 2) + each for each in parts) + photo[2:]
 
 
-def gdepth(path, levels, *, confidence=None, original=None, extended=True, swap=False, photo=None, **values):
+def gdepth(path, levels, *, confidence=None, original=None, extended=True, swap=False, file=None, **values):
     """Write a JPEG with GDepth: near and far are 0.5 and 4 m unless ``values`` say else, empty ones are left out."""
-    keys = {
-        "Format": "RangeInverse",
-        "Near": 0.5,
-        "Far": 4.0,
-        "Units": "m",
-        "Mime": "image/png",
-        "ImageWidth": 256,
-        **values,
-    }
-    data = {"GDepth:Data": encoded(levels)}
-    data |= {} if confidence is None else {"GDepth:Confidence": encoded(confidence)}
-    data |= {} if original is None else {"GImage:Data": original}
-    texts = {name: base64.b64encode(content).decode() for name, content in data.items()}
-    large = " ".join(f'{name}="{text}"' for name, text in texts.items())
+    keys = {"Format": "RangeInverse", "Near": 0.5, "Far": 4.0, "Units": "m", "ImageWidth": 256, **values}
+    sure = b"" if confidence is None else encoded(confidence)
+    data = {"GDepth:Data": encoded(levels), "GDepth:Confidence": sure, "GImage:Data": original}
+    large = " ".join(f'{name}="{base64.b64encode(each).decode()}"' for name, each in data.items() if each)
     names = 'xmlns:GDepth="http://ns.google.com/photos/1.0/depthmap/" '
     names += " ".join(f'GDepth:{name}="{value}"' for name, value in keys.items() if value != "")
-    photo = encoded(globals()["photo"]().repeat(4, 0).repeat(4, 1), ".jpg") if photo is None else photo
+    file = encoded(photo().repeat(4, 0).repeat(4, 1), ".jpg") if file is None else file
     large = _XMP.format(f"{large}>") if extended else large
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(with_xmp(photo, f"{names}>", large, swap) if extended else with_xmp(photo, f"{names} {large}>"))
+    path.write_bytes(with_xmp(file, f"{names}>", large, swap) if extended else with_xmp(file, f"{names} {large}>"))
     return path
 
 

@@ -116,7 +116,7 @@ def test_photo_with_an_orientation_lies_as_stored_and_its_focal_length_is_that_o
     exif[0x0112] = 6
     exif.get_ifd(0x8769)[0xA405] = 52
     photo = encoded(captures.photo().repeat(4, 0).repeat(4, 1), ".jpg", exif=exif)
-    picture = only(captures.gdepth(tmp_path / "photo.jpg", LEVELS, photo=photo))
+    picture = only(captures.gdepth(tmp_path / "photo.jpg", LEVELS, file=photo))
     assert picture.rgb.shape[1:] == captures.HEIC
     assert "orientation is ignored" in said(picture)
     assert picture.camera.fx == pytest.approx(52 / math.hypot(36, 24) * math.hypot(*captures.HEIC))

@@ -67,9 +67,9 @@ class _JpegImage(Source):
             inverse = 1 / near + share * (1 / far - 1 / near)
             depth = 1 / inverse if kind == "rangeinverse" else near + share * (far - near)
             depth = (1 / depth if unit == "diopters" else depth * _METRES.get(unit, 1.0)).astype(np.float32)
-        confidence = self._grey(pictures["confidence"]) if pictures["confidence"] else depth
-        if confidence.shape == depth.shape:  # another size is refused when confidence is read
-            depth[confidence < _NO_CONFIDENCE] = np.nan  # where Android writes near
+        sure = self._grey(pictures["confidence"]) if pictures["confidence"] else np.ones_like(depth)
+        if sure.shape == depth.shape:  # another size is refused when confidence is read
+            depth[sure < _NO_CONFIDENCE] = np.nan  # where Android writes near
         return depth
 
     def _grey(self, content: bytes) -> np.ndarray:
@@ -135,18 +135,14 @@ def _read(path: Path) -> tuple[dict[str, bytes], _Values]:
         camera, names = found, ("GImage:Data", "GDepth:Data", "GDepth:Confidence")
         original, depth, confidence = (_decoded(path, name, found.get(name, "")) for name in names)
     elif camera:
-        files, names = (
-            _files(path, content, place, groups),
-            ("Image:ItemURI", "DepthMap:DepthURI", "DepthMap:ConfidenceURI"),
-        )
+        names = "Image:ItemURI", "DepthMap:DepthURI", "DepthMap:ConfidenceURI"
+        files = _files(path, content, place, groups)
         original, depth, confidence = (files.get(camera.get(name, ""), b"") for name in names)
     else:
         raise ValueError(f"{path}: expected GDepth:Data or DepthMap:DepthURI in the XMP, there is neither")
     if original and picture_size(BytesIO(original)) == picture_size(BytesIO(content)):  # the photo before effects
         content = original
-    values = {
-        name.partition(":")[2]: value for name, value in camera.items() if not name.startswith(("GImage", "Item"))
-    }
+    values = {re.sub("^(GDepth|DepthMap):", "", name): value for name, value in camera.items()}
     return {"photo": content, "depth": depth, "confidence": confidence}, values
 
 
