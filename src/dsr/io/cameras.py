@@ -191,13 +191,19 @@ def _fit_to_photo(
     if across and pixels_in_header(photo) != size:
         orientation = read_exif(photo).orientation
     if orientation >= 5:  # the photo is turned, the camera is that of the sensor
-        cx = camera.height - 1 - camera.cy if orientation in (6, 7) else camera.cy
-        cy = camera.width - 1 - camera.cx if orientation in (7, 8) else camera.cx
-        turned = replace(camera, width=camera.height, height=camera.width, fx=camera.fy, fy=camera.fx, cx=cx, cy=cy)
-        content = replace(content, camera=turned)
+        content = replace(content, camera=turn_camera(camera, orientation))
         assumptions.append(Assumption("camera: turned as the photo is by its EXIF data"))
     content, scaled = scale_to_photo(path, content, size)
     return content, [*assumptions, *scaled]
+
+
+def turn_camera(camera: Camera, orientation: int) -> Camera:
+    """Return the camera of a picture that is turned as an EXIF orientation says."""
+    cx = camera.width - 1 - camera.cx if orientation in (2, 3, 7, 8) else camera.cx
+    cy = camera.height - 1 - camera.cy if orientation in (3, 4, 6, 7) else camera.cy
+    if orientation < 5:
+        return replace(camera, cx=cx, cy=cy)
+    return replace(camera, width=camera.height, height=camera.width, fx=camera.fy, fy=camera.fx, cx=cy, cy=cx)
 
 
 def scale_to_photo(path: Path, content: CameraFile, size: Size) -> tuple[CameraFile, list[Assumption]]:
@@ -214,8 +220,8 @@ def scale_camera(place: object, camera: Camera, size: Size, whose: str = "depth 
     height, width = size
     if not same_aspect((camera.height, camera.width), size):
         raise ValueError(
-            f"{place}: the camera is of {camera.width} x {camera.height} pixels (width x height), the {whose} has "
-            f"{width} x {height}, another aspect"
+            f"{place}: expected a camera of the {whose}'s aspect, {width} x {height}, got {camera.width} x "
+            f"{camera.height} pixels (width x height)"
         )
     return camera.rescale(width, height)
 

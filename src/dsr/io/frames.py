@@ -17,7 +17,7 @@ from dsr.geometry.poses import Matrix
 from dsr.io.depth_files import DEPTH_SUFFIXES
 from dsr.io.images import Size, read_array
 from dsr.notes import Assumption
-from dsr.utils.guards import naming, pixels_beside
+from dsr.utils.guards import expect_size, naming, pixels_beside
 from dsr.utils.versions import hash_once
 
 Record = dict[str, str | int]  # identifies an input in info.json: name, SHA-256, and a frame's number if it has one
@@ -151,11 +151,7 @@ class ConfidenceMap:
     def read(self, size: Size) -> np.ndarray:
         """Return the confidence of a depth map of (h, w), float32 from 0 to 1."""
         values = _read_values(self.path, pixels_beside(*size)) if self.source is None else self.source.read()
-        if values.shape != size:
-            raise ValueError(
-                f"{self.path}: expected confidence of the depth map's {size[1]} x {size[0]} pixels (width x height), "
-                f"got {values.shape[1]} x {values.shape[0]}"
-            )
+        expect_size(f"{self.path}: expected confidence of the depth map's", values, size)
         outside = values[~((values >= 0) & (values <= self.highest))]
         if outside.size:
             raise ValueError(f"{self.path}: expected confidence from 0 to {self.highest:g}, got {outside[0]}")

@@ -42,7 +42,7 @@ from dsr.io.trajectories import read_transform
 from dsr.io.units import TURNED_BACK, Meaning, expect_narrow, interpret
 from dsr.notes import LIMITS, Assumption
 from dsr.sample import FARTHEST, NEAREST
-from dsr.utils.guards import natural_key, pixels_beside
+from dsr.utils.guards import expect_size, natural_key, pixels_beside
 from dsr.utils.progress import show_length
 
 _Kind = tuple[Path, str, str, bool]  # folder, suffix, type of value, and whether disparities were ruled out
@@ -132,11 +132,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     notes += [*values.notes, *values.hole_notes]
     if pair.mask is not None:
         mask = read_mask(pair.mask, pixels_beside(*size_lr))
-        if mask.shape != size_lr:
-            raise ValueError(
-                f"{pair.mask}: expected a mask of the depth map's {size_lr[1]} x {size_lr[0]} pixels (width x height), "
-                f"got {mask.shape[1]} x {mask.shape[0]}"
-            )
+        expect_size(f"{pair.mask}: expected a mask of the depth map's", mask, size_lr)
         holes |= ~mask
     confidence, confident = _confidence(pair, reading, size_lr, holes)
     expect_known(pair.depth, stored, holes)

@@ -52,6 +52,13 @@ def expect_pixels(place: str | Path, height: int, width: int, most: int = MOST_P
         raise TooLargeError(f"{place}: expected at most {most} pixels, got {width} x {height} (width x height)")
 
 
+def expect_size(expected: str, pixels: Any, size: tuple[int, int]) -> None:
+    """Raise a ValueError if pixels, (H, W) or (H, W, C), are not of a size; the message begins with ``expected``."""
+    got = pixels.shape
+    if got[:2] != size:
+        raise ValueError(f"{expected} {size[1]} x {size[0]} pixels (width x height), got {got[1]} x {got[0]}")
+
+
 def expect_bytes(place: str | Path, size: int, most: int) -> None:
     """Raise TooLargeError if something declares that it takes more than ``most`` bytes in memory."""
     if size > most:

@@ -4,6 +4,7 @@ import atexit
 import contextlib
 import functools
 import lzma
+import math
 import struct
 import tempfile
 import zipfile
@@ -62,6 +63,14 @@ def inflate(content: bytes, size: int, bits: int = zlib.MAX_WBITS) -> bytes:
             f"expected compressed data of {size} bytes, got {'more' if len(values) > size else len(values)}"
         )
     return values
+
+
+def as_pixels(content: bytes, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Return values of a type that are stored one after another as an array of a shape."""
+    if len(content) != math.prod(shape) * np.dtype(dtype).itemsize:
+        sides = " x ".join(map(str, shape))
+        raise ValueError(f"expected {sides} values (height x width) of {np.dtype(dtype)}, got {len(content)} bytes")
+    return np.frombuffer(content, dtype).reshape(shape)
 
 
 def decode_photo(content: bytes) -> np.ndarray:

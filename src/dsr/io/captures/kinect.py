@@ -22,11 +22,11 @@ from pydantic import AliasPath, BaseModel, Field
 
 from dsr.geometry.camera import Camera, Lens
 from dsr.geometry.poses import as_rigid, invert
-from dsr.io.captures.archive import decode_photo
+from dsr.io.captures.archive import as_pixels, decode_photo
 from dsr.io.frames import CaptureFrame, Geometry, Part, Record, Rig, Size, file_state, stated
 from dsr.io.pairs import PairingResult, Shot, pair_by_time
 from dsr.io.trajectories import describe_capture, intrinsics_camera
-from dsr.utils.guards import expect_pixels, numbers_in, opened, refusing
+from dsr.utils.guards import expect_pixels, expect_size, numbers_in, opened, refusing
 from dsr.utils.validation import Number, Whole, parse_model
 from dsr.utils.versions import how_to_install
 
@@ -96,20 +96,13 @@ def _decode(size: Size, kind: str, content: bytes) -> np.ndarray:
     height, width = size
     if kind == "MJPG":
         photo = decode_photo(content)
-        if photo.shape[:2] != size:
-            got = f"{photo.shape[1]} x {photo.shape[0]}"
-            raise ValueError(f"expected a photo of {width} x {height} pixels, got {got}")
+        expect_size("expected a photo of", photo, size)
         return photo
     each, code = _COLOURS.get(kind, (2, 0))
-    if len(content) != height * width * each:
-        raise ValueError(
-            f"expected {width} x {height} pixels of {each:g} bytes, which are {height * width * each:g}, "
-            f"got {len(content)} bytes"
-        )
     if kind == _DEPTH:
-        return np.frombuffer(content, ">u2").reshape(size).astype(np.uint16)
+        return as_pixels(content, ">u2", size).astype(np.uint16)
     rows = (height * 3 // 2, width, 1) if kind == "NV12" else (height, width, int(each))
-    return cv2.cvtColor(np.frombuffer(content, np.uint8).reshape(rows), code)
+    return cv2.cvtColor(as_pixels(content, "u1", rows), code)
 
 
 def read(path: Path) -> PairingResult:

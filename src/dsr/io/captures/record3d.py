@@ -23,7 +23,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from dsr.geometry.poses import from_quaternion
-from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo, members, read_part
+from dsr.io.captures.archive import PHOTO_LIMIT, as_pixels, decode_photo, members, read_part
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Part, Size, stated
 from dsr.io.pairs import Pair, PairingResult, numbered_files, paired
 from dsr.io.trajectories import ARKIT_TO_DSR, describe_capture, intrinsics_camera
@@ -142,10 +142,4 @@ def decode_lzfse(content: bytes, size: Size, dtype: str) -> np.ndarray:
         import lzfse  # noqa: PLC0415 - an extra
     with refusing(f"expected LZFSE data, got {len(content)} damaged bytes", lzfse.error, MemoryError):
         values = lzfse.decompress(content)
-    expected = size[0] * size[1] * np.dtype(dtype).itemsize
-    if len(values) != expected:
-        raise ValueError(
-            f"expected {size[1]} x {size[0]} values of {np.dtype(dtype)} ({expected} bytes), "
-            f"got LZFSE data of {len(values)}"
-        )
-    return np.frombuffer(values, dtype).reshape(size)
+    return as_pixels(values, dtype, size)

@@ -30,7 +30,7 @@ from pydantic import BaseModel, Field, RootModel
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.poses import as_rigid
-from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo, inflate, read_section
+from dsr.io.captures.archive import PHOTO_LIMIT, as_pixels, decode_photo, inflate, read_section
 from dsr.io.captures.stray import VideoFrame, frames_of_video
 from dsr.io.frames import CaptureFrame, Geometry, Part, Size, stated
 from dsr.io.images import read_numbers
@@ -121,28 +121,18 @@ def _read_header(path: Path, file: BufferedReader) -> _Sens:
 
 def _photo(header: _Sens, content: bytes) -> np.ndarray:
     """Return the photo in the bytes of a frame."""
-    if header.compression[0]:
-        return decode_photo(content)
-    if len(content) != 3 * header.photo[0] * header.photo[1]:
-        raise ValueError(f"expected {header.photo[1]} x {header.photo[0]} colours, got {len(content)} bytes")
-    return np.frombuffer(content, np.uint8).reshape(*header.photo, 3)
+    return decode_photo(content) if header.compression[0] else as_pixels(content, "u1", (*header.photo, 3))
 
 
 def _depth(header: _Sens, content: bytes) -> np.ndarray:
     """Return the depth map in the bytes of a frame, (h, w) uint16."""
-    size = 2 * header.depth[0] * header.depth[1]
-    values = inflate(content, size) if header.compression[1] else content
-    if len(values) != size:
-        raise ValueError(f"expected {header.depth[1]} x {header.depth[0]} values of 16 bits, got {len(values)} bytes")
-    return np.frombuffer(values, "<u2").reshape(header.depth)
+    content = inflate(content, 2 * header.depth[0] * header.depth[1]) if header.compression[1] else content
+    return as_pixels(content, "<u2", header.depth)
 
 
 def _sens_geometry(place: str, header: _Sens, values: tuple[float, ...]) -> Geometry:
     """Return camera and pose of a frame."""
-    camera, matrix = intrinsics_camera(place, header.photo, header.intrinsics), np.reshape(values, (4, 4))
-    if not np.isfinite(matrix).all():
-        return Geometry(camera, None, (NO_POSE,))
-    return Geometry(camera, as_rigid(matrix, place))
+    return _placed(intrinsics_camera(place, header.photo, header.intrinsics), np.reshape(values, (4, 4)), place)
 
 
 def find_export(folder: Path) -> PairingResult | None:
@@ -178,9 +168,14 @@ def _export_geometry(matrices: list[Path], path: Path, size: Size) -> Geometry:
 def with_pose(camera: Camera | None, path: Path, notes: tuple[Assumption, ...] = ()) -> Geometry:
     """Return a camera with the pose of 4 x 4 numbers in a text file; none if it is missing, or tracking was lost."""
     matrix = read_numbers(path, 16).reshape(4, 4) if path.is_file() else np.full((4, 4), np.nan)
+    return _placed(camera, matrix, str(path), notes)
+
+
+def _placed(camera: Camera | None, matrix: np.ndarray, place: str, notes: tuple[Assumption, ...] = ()) -> Geometry:
+    """Return a camera with a pose, (4, 4), that is not finite where there is none."""
     if not np.isfinite(matrix).all():
         return Geometry(camera, None, (*notes, NO_POSE))
-    return Geometry(camera, as_rigid(matrix, str(path)), notes)
+    return Geometry(camera, as_rigid(matrix, place), notes)
 
 
 _Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]
