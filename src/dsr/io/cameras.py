@@ -107,7 +107,6 @@ def read_camera(path: Path) -> CameraFile:
 
 
 def _of_json(path: Path, text: str) -> CameraFile:
-    """Return the content of a ``camera.json`` of dsr, or a ``cam_params.json`` as NICE-SLAM's data sets have it."""
     if '"camera"' in text or any(f'"{name}"' in text for name in _SCALES):
         params = (
             parse_model(_NestedParams, text, path).camera if '"camera"' in text else parse_model(_Params, text, path)
@@ -219,10 +218,8 @@ def scale_camera(place: object, camera: Camera, size: Size, whose: str = "depth 
     """Return a camera scaled to a picture's (height, width); a message begins with ``place``."""
     height, width = size
     if not same_aspect((camera.height, camera.width), size):
-        raise ValueError(
-            f"{place}: expected a camera of the {whose}'s aspect, {width} x {height}, got {camera.width} x "
-            f"{camera.height} pixels (width x height)"
-        )
+        got = f"{camera.width} x {camera.height} (width x height)"
+        raise ValueError(f"{place}: expected a camera of the {whose}'s aspect, {width} x {height}, got {got}")
     return camera.rescale(width, height)
 
 

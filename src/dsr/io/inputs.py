@@ -243,7 +243,6 @@ def _interpret(
 
 
 def _stored(pair: Pair) -> np.ndarray:
-    """Return the depth map of a pair as it is stored, (h, w)."""
     if pair.capture is not None and pair.capture.depth is not None:
         return pair.capture.depth.read()
     photo = pixels_in_header(pair.rgb)
@@ -264,7 +263,6 @@ def _expect_distances(path: Path, depth_lr: Tensor, holes: np.ndarray, range_typ
 
 
 def _is_icl(pair: Pair) -> bool:
-    """Return whether the depth map is a text file of ICL-NUIM."""
     return pair.capture is None and pair.depth.suffix.lower() == ICL_SUFFIX
 
 

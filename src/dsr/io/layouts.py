@@ -238,7 +238,6 @@ def _role_folders(folder: Path) -> PairingResult:
 
 
 def _side_by_side(folder: Path) -> PairingResult:
-    """Return the pairs among the files of a folder."""
     roles = {path: role_of(path) for path in list_pictures(folder)}
     photos = [path for path, role in roles.items() if role == "rgb"]
     depths = [path for path, role in roles.items() if role == "depth"]

@@ -67,10 +67,8 @@ class Trajectory:
                         f"{min(self.times):.3f} to {max(self.times):.3f}"
                     )
         if len(self.poses) != len(pairs):
-            raise ValueError(
-                f"{self.file}: expected a pose for each of the {len(pairs)} frames, or their times, got "
-                f"{len(self.poses)} poses"
-            )
+            got = f"{len(self.poses)} poses for {len(pairs)} frames"
+            raise ValueError(f"{self.file}: expected a pose for each frame, or their times, got {got}")
         return {pair.name: pose for pair, pose in zip(pairs, self.poses, strict=True) if pose is not None}
 
     def at(self, wanted: np.ndarray, gap: float = _MAX_GAP) -> list[Matrix | None]:
@@ -156,7 +154,6 @@ def order_of(numbers: Sequence[float]) -> list[int]:
 
 
 def _numbers(path: Path, text: str) -> list[list[float]]:
-    """Return the numbers in each line that has any."""
     rows = []
     for number, line in enumerate(text.splitlines(), 1):
         words = split_numbers(line.partition("#")[0])

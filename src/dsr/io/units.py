@@ -201,9 +201,7 @@ def _by_median(seen: _Map) -> Meaning:
         if _MIN_MEDIAN <= middle * unit <= _MAX_MEDIAN:
             why = f"as millimetres the median would be {seen.metres(1e-3)}, now {seen.metres(unit)}"
             return Meaning(unit, (Assumption(f"whole numbers are read as {label}", why),))
-    raise ValueError(
-        f"{seen.name}: no usual unit makes its median of {middle:g} a distance; give one with --depth-unit"
-    )
+    raise ValueError(f"{seen.name}: no usual unit makes its median of {middle:g} a distance; give one (--depth-unit)")
 
 
 def _interpret_floats(seen: _Map) -> Meaning:

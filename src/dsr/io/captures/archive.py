@@ -83,7 +83,6 @@ def decode_photo(content: bytes) -> np.ndarray:
 
 @functools.lru_cache(maxsize=1)
 def _open(path: Path, _state: tuple[int, int]) -> zipfile.ZipFile:
-    """Return the open archive."""
     with refusing(f"{path}: expected a ZIP archive, got a damaged, truncated or foreign file", *_DAMAGED):
         return zipfile.ZipFile(path)
 

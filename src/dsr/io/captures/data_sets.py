@@ -158,7 +158,6 @@ def find_zed(folder: Path) -> PairingResult | None:
 
 
 def _zed(path: Path, text: str, size: Size) -> Geometry:
-    """Return the camera of the rectified photo of (height, width)."""
     if size not in _ZED_SIZES:
         sizes = ", ".join(f"{width} x {height}" for height, width in _ZED_SIZES)
         return Geometry(None, None, (Assumption(f"{path.name} is not used: it is of photos of {sizes}"),))

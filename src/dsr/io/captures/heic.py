@@ -65,7 +65,6 @@ def read(path: Path) -> PairingResult:
 
 
 def _geometry(path: Path, xmp: bytes) -> Geometry:
-    """Return the camera of the photo as it is shown."""
     text = xmp.decode(errors="replace")
     accuracy = re.search(r"depthData:Accuracy\W{1,3}(\w+)", text)
     absolute = accuracy is not None and accuracy[1] == "absolute"

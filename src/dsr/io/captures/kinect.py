@@ -81,7 +81,6 @@ class _Packet(Part):
 
 
 def _fetch(path: Path, number: int, time: int) -> bytes:
-    """Return the frame of a track as it is stored."""
     with _recording(path) as container:
         track = container.streams[number]
         container.seek(time, stream=track, any_frame=True)
@@ -140,7 +139,6 @@ def read(path: Path) -> PairingResult:
 
 
 def _track(path: Path, container: Any, role: str) -> Any:
-    """Return a track by its tag or its name."""
     name = role.upper()
     for track in container.streams.video:
         known = f"K4A_{name}_TRACK" in track.metadata or track.metadata.get("title") == name
@@ -186,7 +184,6 @@ def _part_of(place: str, numbers: Sequence[float], whole: Size, cut: tuple[float
 
 
 def _lens(place: str, camera: _Camera) -> Lens:
-    """Return the lens of a camera."""
     kind = camera.kind
     k1, k2, k3, k4, k5, k6, codx, cody, p2, p1 = camera.numbers[4:14]
     if kind != _LENS and (kind != _LENS_6KT or codx or cody):  # with a centre of its own: of devices that were not sold

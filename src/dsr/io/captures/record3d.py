@@ -126,7 +126,6 @@ def _frames(
 
 
 def _geometry(place: str, metadata: _Metadata, own: list[float] | None, pose: list[float] | None) -> Geometry:
-    """Return camera and pose of a frame, whose intrinsics may be its own."""
     K = metadata.K
     camera = intrinsics_camera(place, (metadata.h, metadata.w), own or [K[0], K[4], K[6], K[7]])
     text = "camera: K of the first frame; the metadata have none of each frame"

@@ -107,31 +107,23 @@ def _read_header(path: Path, file: BufferedReader) -> _Sens:
     matrix, (colour, depth) = values[:16], values[64:66]
     wide, high, narrow, low, scale, count = values[66:]
     if colour not in (0, 1, 2) or depth not in (0, 1):
-        raise ValueError(
-            f"{path}: expected colour that is raw, PNG or JPEG (0, 1, 2) and depth that is raw or of zlib (0, 1), got "
-            f"compression {colour} and {depth}"
-        )
+        raise ValueError(f"{path}: expected colour as 0, 1, 2, depth as 0, 1, got compression {colour} and {depth}")
     if not all(1 <= side <= _LARGEST_SIDE for side in (wide, high, narrow, low)) or not 1 <= scale <= 1e6:
-        raise ValueError(
-            f"{path}: expected sizes and values per metre, got {wide} x {high}, {narrow} x {low} and {scale:g}"
-        )
+        raise ValueError(f"{path}: expected sizes and values per metre, got {wide}x{high}, {narrow}x{low}, {scale:g}")
     numbers = [matrix[0], matrix[5], matrix[2], matrix[6]]
     return _Sens(numbers, (colour, depth), (high, wide), (low, narrow), scale, count)
 
 
 def _photo(header: _Sens, content: bytes) -> np.ndarray:
-    """Return the photo in the bytes of a frame."""
     return decode_photo(content) if header.compression[0] else as_pixels(content, "u1", (*header.photo, 3))
 
 
 def _depth(header: _Sens, content: bytes) -> np.ndarray:
-    """Return the depth map in the bytes of a frame, (h, w) uint16."""
     content = inflate(content, 2 * header.depth[0] * header.depth[1]) if header.compression[1] else content
     return as_pixels(content, "<u2", header.depth)
 
 
 def _sens_geometry(place: str, header: _Sens, values: tuple[float, ...]) -> Geometry:
-    """Return camera and pose of a frame."""
     return _placed(intrinsics_camera(place, header.photo, header.intrinsics), np.reshape(values, (4, 4)), place)
 
 
@@ -251,7 +243,6 @@ def _map(content: bytes) -> np.ndarray:
 
 
 def _iphone_geometry(place: str, entry: _Entry, size: Size) -> Geometry:
-    """Return camera and pose of a frame."""
     camera, notes = None, [] if entry.aligned_pose else [NO_POSE]
     if entry.intrinsic is not None:
         (fx, _, cx), (_, fy, cy), _ = entry.intrinsic

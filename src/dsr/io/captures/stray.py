@@ -104,7 +104,6 @@ def _read_odometry(path: Path) -> dict[int, _Row]:
 
 
 def _geometry(folder: Path, number: int, row: _Row, text: str, size: Size) -> Geometry:
-    """Return camera and pose of a frame."""
     place = f"{folder / 'odometry.csv'}: frame {number}"
 
     def numbers(names: tuple[str, ...]) -> list[float]:
