@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AliasChoices, BaseModel, BeforeValidator, Field
+from pydantic import AliasChoices, BaseModel, BeforeValidator, Field, model_validator
 from torch import Tensor
 
 from dsr.geometry.camera import ASSUMED_FOV, Camera, RangeType, expect_intrinsics
@@ -42,10 +42,7 @@ class CameraFile:
 
 
 def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) -> tuple[CameraFile, list[Assumption]]:
-    """Return the camera of a photo's pixels, with the depth encoding from its file, and the assumptions.
-
-    ``size_lr`` is the size of the depth map, to which a matrix without an image size may belong.
-    """
+    """Return the camera of a photo's pixels, with the depth encoding from its file, and the assumptions."""
     height, width = size
     if choice.file is not None:
         return _fit_to_photo(choice.file, read_any_camera(choice.file), size, size_lr, photo)
@@ -108,9 +105,7 @@ def read_camera(path: Path) -> CameraFile:
 
 def _of_json(path: Path, text: str) -> CameraFile:
     if '"camera"' in text or any(f'"{name}"' in text for name in _SCALES):
-        params = (
-            parse_model(_NestedParams, text, path).camera if '"camera"' in text else parse_model(_Params, text, path)
-        )
+        params = parse_model(_Params, text, path)
         with naming(path):
             camera = Camera(params.w, params.h, params.fx, params.fy, params.cx, params.cy)
         return CameraFile(camera, depth_unit=None if params.scale is None else 1 / params.scale)
@@ -163,11 +158,9 @@ class _Params(BaseModel, strict=True):
     cy: _Number
     scale: Annotated[_Number, Field(ge=1)] | None = Field(None, validation_alias=AliasChoices(*_SCALES))
 
-
-class _NestedParams(BaseModel, strict=True):
-    """The same under the key ``camera``."""
-
-    camera: _Params
+    _unwrap = model_validator(mode="before")(
+        lambda entries: entries.get("camera", entries) if isinstance(entries, dict) else entries
+    )
 
 
 class _Open3d(BaseModel, strict=True):
@@ -233,10 +226,8 @@ def _camera_of_matrix(path: Path, matrix: np.ndarray, size: Size, size_lr: Size)
         if may_be_of(cx, cy, width, height):
             camera = Camera(width, height, matrix[0, 0], matrix[1, 1], cx, cy)
             return CameraFile(camera), [Assumption(f"camera: the matrix is read in pixels of the {name}")]
-    raise ValueError(
-        f"{path}: expected a principal point near the middle of the photo, {size[1]} x {size[0]} pixels (width x "
-        f"height), or of the depth map, {size_lr[1]} x {size_lr[0]}; got {cx:g}, {cy:g}"
-    )
+    text = f"the photo, {size[1]} x {size[0]} (width x height), or of the depth map, {size_lr[1]} x {size_lr[0]}"
+    raise ValueError(f"{path}: expected a principal point near the middle of {text}; got {cx:g}, {cy:g}")
 
 
 def _of_yaml(path: Path, text: str) -> CameraFile:

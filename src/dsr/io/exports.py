@@ -266,9 +266,10 @@ def write_stereo(path: Path, rgb: Tensor, depth: Tensor, camera: Camera) -> list
     photography. Points at depth Z are shifted by f * distance / Z. What the photo does not show, and holes of the
     depth, (1, H, W) in metres, continue what is behind them.
     """
-    inverse = _filled_inverse(depth)
+    inverse, _ = _filled(depth[0].double().reciprocal().nan_to_num(-1.0).numpy())
     height, width = inverse.shape
-    eyes = min(_EYES, width / (_MOST_SHIFT * camera.fx * float(np.quantile(inverse, _NEARLY_ALL))))
+    nearest = max(float(np.quantile(inverse, _NEARLY_ALL)), 1e-9)
+    eyes = min(_EYES, width / (_MOST_SHIFT * camera.fx * nearest))
     shift = camera.fx * eyes * inverse
     rows, columns = np.mgrid[:height, :width]
     seen = torch.full((height * width,), -1.0, dtype=torch.float64)  # shifts; the nearest point hides others
@@ -277,8 +278,7 @@ def write_stereo(path: Path, rgb: Tensor, depth: Tensor, camera: Camera) -> list
         shown = pure & (target >= 0)
         places = torch.from_numpy((rows * width + target).astype(np.int64)[shown])
         seen.scatter_reduce_(0, places, torch.from_numpy(shift[shown]), "amax")
-    behind = _behind(seen.view(height, width).numpy())
-    shifts = np.take_along_axis(seen.view(height, width).numpy(), behind, 1).clip(0)
+    shifts, behind = _filled(seen.view(height, width).numpy())
     source = (2 * behind - columns + shifts).clip(0, width - 1)  # mirrored at the edge of a gap
     nearer = np.take_along_axis(shift, source.round().astype(np.int64), 1) >= shifts + 1
     source = np.where(nearer, behind + shifts, source)
@@ -290,12 +290,12 @@ def write_stereo(path: Path, rgb: Tensor, depth: Tensor, camera: Camera) -> list
     return [Assumption("the views of the stereo picture are apart", show_length(eyes))]
 
 
-def write_rgbd_picture(path: Path, rgb: Tensor, depth: Tensor, _: Camera) -> list[Assumption]:
+def write_rgbd_picture(path: Path, rgb: Tensor, depth: Tensor, _camera: Camera) -> list[Assumption]:
     """Write a PNG of the photo and, at its right, its inverse depth as grey from far, black, to near, white.
 
     Holes of the depth, (1, H, W) in metres, continue what is behind them.
     """
-    inverse = _filled_inverse(depth)
+    inverse, _ = _filled(depth[0].double().reciprocal().nan_to_num(-1.0).numpy())
     far, near = np.quantile(inverse, (1 - _NEARLY_ALL, _NEARLY_ALL))
     grey = as_bytes(torch.from_numpy((inverse - far) / max(near - far, np.finfo(float).tiny)))
     photo = as_bytes(rgb.flip(0)).transpose(1, 2, 0)
@@ -303,20 +303,15 @@ def write_rgbd_picture(path: Path, rgb: Tensor, depth: Tensor, _: Camera) -> lis
     return []
 
 
-def _filled_inverse(depth: Tensor) -> np.ndarray:
-    """Return the inverse of a map, (1, H, W), in 1/m, (H, W); holes have that of what is behind them, or 0."""
-    inverse = depth[0].double().reciprocal().nan_to_num(-1.0).cpu().numpy()
-    return np.take_along_axis(inverse, _behind(inverse), 1).clip(0)
-
-
-def _behind(inverse: np.ndarray) -> np.ndarray:
-    """Return each pixel's column, (H, W); of one below 0 that of the farther of the nearest others in its row."""
-    width, known, columns = inverse.shape[1], inverse >= 0, np.arange(inverse.shape[1])
-    left = np.maximum.accumulate(np.where(known, columns, 0), 1)
-    right = np.minimum.accumulate(np.where(known, columns, width - 1)[:, ::-1], 1)[:, ::-1]
+def _filled(inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return inverse depth, (H, W), with what is behind its holes, the values below 0, and the column of that."""
+    columns = np.broadcast_to(np.arange(inverse.shape[1]), inverse.shape)
+    left = np.maximum.accumulate(np.where(inverse >= 0, columns, 0), 1)
+    right = np.minimum.accumulate(np.where(inverse >= 0, columns, columns[0, -1])[:, ::-1], 1)[:, ::-1]
     sides = np.stack([np.take_along_axis(inverse, each, 1) for each in (left, right)])
     first, second = np.where(sides < 0, np.inf, sides)
-    return np.where(first < second, left, right)
+    behind = np.where(first < second, left, right)
+    return np.take_along_axis(inverse, behind, 1).clip(0), behind
 
 
 class _Glb:

@@ -30,10 +30,7 @@ _Arguments = ParamSpec("_Arguments")
 
 @dataclass(frozen=True)
 class Source:
-    """A photo or a map inside a file: a frame of a video, a member of an archive, a message of a recording.
-
-    Other processes get it pickled and read the file anew.
-    """
+    """A photo or a map inside a file, such as a frame of a video; other processes get it pickled and read it anew."""
 
     file: Path
     name: str  # within the file
@@ -49,10 +46,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Part(Source):
-    """Bytes of a file that ``fetch`` returns, and of which ``decode`` makes pixels; its errors need not name the file.
-
-    Both are functions of modules or partial ones, as other processes get them.
-    """
+    """Bytes of a file that ``fetch`` returns, and of which ``decode`` makes pixels; both can be pickled."""
 
     fetch: Callable[[], bytes]
     decode: Callable[[bytes], np.ndarray]

@@ -320,10 +320,8 @@ def _expect_lower_resolution(pair: Pair, size: Size, size_lr: Size) -> None:
     if low > height or narrow > width:
         raise ValueError(f"{pair.depth}: expected no more pixels than the photo, got {narrow} x {low}; {what}")
     if not same_aspect(size, size_lr) and abs(low - height * narrow / width) >= 1:
-        raise ValueError(
-            f"{pair.depth}: expected the photo's aspect and field of view, got {narrow} x {low}; {what}: "
-            "crop the one that sees more"
-        )
+        text = f"the photo's aspect and field of view, got {narrow} x {low}; {what}: crop the one that sees more"
+        raise ValueError(f"{pair.depth}: expected {text}")
     if low < 2 or narrow < 2:
         raise ValueError(f"{pair.depth}: expected at least 2 x 2 pixels, got {narrow} x {low}")
 
@@ -376,10 +374,8 @@ def _to_photo(
     notes += doubt_camera(rig.camera, "--depth-camera" if given else "depth camera")
     warped = warp_depth(depth_lr[None], rig.camera, torch.from_numpy(rig.transform)[None], target)[0]
     if not bool(warped.isfinite().any()):
-        raise ValueError(
-            f"{'--extrinsics' if given else _camera_source(pair, reading)}: expected the transform from the depth "
-            "camera's frame to the photo camera's, in metres; with this one the photo shows nothing of the depth map"
-        )
+        text = "the transform from the depth camera's frame to the photo camera's, in metres; the photo shows nothing"
+        raise ValueError(f"{'--extrinsics' if given else _camera_source(pair, reading)}: expected {text} of the depth")
     if given:
         inverse = torch.from_numpy(np.linalg.inv(rig.transform))[None]
         other = warp_depth(depth_lr[None], rig.camera, inverse, target)[0]

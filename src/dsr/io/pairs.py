@@ -220,10 +220,8 @@ def find_pairs_of_two_folders(photos: Path, depths: Path, masks: Sequence[Path])
     right = [path for path in list_pictures(depths) if path.suffix.lower() in READ_SUFFIXES]
     found = match_pairs(left, right, find_camera_file(photos, photos.parent))
     if not found.pairs:
-        raise ValueError(
-            f"{photos} and {depths}: expected photos and depth maps of the same names, numbers or times (within 20 "
-            f"ms); of {len(left)} and {len(right)} none belong together"
-        )
+        text = f"the same names, numbers or times (within 20 ms); of {len(left)} and {len(right)} none belong together"
+        raise ValueError(f"{photos} and {depths}: expected photos and depth maps of {text}")
     return found
 
 

@@ -168,10 +168,7 @@ def read_exif(photo: Path) -> Exif:
 
 
 def write_png(path: Path, picture: np.ndarray, known: np.ndarray | None = None) -> None:
-    """Write a picture, grey (H, W) or blue-green-red (H, W, 3), uint8 or uint16, atomically.
-
-    ``known``, (H, W) bool: an 8-bit picture is transparent elsewhere.
-    """
+    """Write a picture, grey (H, W) or blue-green-red (H, W, 3), uint8 or uint16, transparent if not ``known``."""
     if known is not None and not known.all():
         picture = np.dstack((picture, np.where(known, 255, 0).astype(np.uint8)))
     with replacing(path) as temporary:

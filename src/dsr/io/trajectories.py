@@ -120,10 +120,9 @@ def read_poses(path: Path) -> Trajectory:
     if lengths == {4} and len(rows) % 4 == 0:
         rows = np.reshape(rows, (-1, 16)).tolist()
     elif not timed and lengths not in ({12}, {16}):
+        text = "lines of 8 numbers (time, translation, quaternion), 9 (and an id), 12, 16 or four times 4 (a matrix)"
         raise ValueError(
-            f"{path}: expected lines of 8 numbers (time, translation, quaternion) or 9 (and an id), of 12 or 16 (a "
-            f"matrix), or four lines of 4 for each matrix, got lines of {', '.join(map(str, sorted(lengths))) or 'no'} "
-            "numbers"
+            f"{path}: expected {text}, got lines of {', '.join(map(str, sorted(lengths))) or 'no'} numbers"
         )
     poses: list[Matrix | None] = []
     for number, row in enumerate(rows, 1):
@@ -180,10 +179,7 @@ def _matrix_of_json(path: Path, text: str) -> list[list[float]]:
 
 
 def check_pose(source: str, matrix: np.ndarray, *, opengl: bool = False) -> np.ndarray:
-    """Return a rigid transform (4, 4) from camera to world as it is; ``source`` is the file and the place in it.
-
-    ``opengl``: the camera's axes are x right, y up, z backward, as ARKit and OpenGL have them.
-    """
+    """Return a rigid transform (4, 4) from camera to world; ``opengl``: the camera's axes are x right, y up."""
     if matrix.shape != (4, 4):
         raise ValueError(f"{source}: expected a matrix of 4 x 4 numbers, got {' x '.join(map(str, matrix.shape))}")
     as_rigid(matrix, source)
@@ -206,10 +202,8 @@ def fitting_camera(source: str, sizes: Sequence[tuple[int, int]], numbers: Seque
         if may_be_of(cx, cy, width, height):
             return intrinsics_camera(source, (height, width), numbers)
     intrinsics_camera(source, sizes[0], numbers)  # says what is wrong with numbers that are not finite
-    raise ValueError(
-        f"{source}: expected a principal point near the middle of the {sizes[0][1]} x {sizes[0][0]} photo (width x "
-        f"height), got {cx:g}, {cy:g}"
-    )
+    text = f"near the middle of the {sizes[0][1]} x {sizes[0][0]} photo (width x height)"
+    raise ValueError(f"{source}: expected a principal point {text}, got {cx:g}, {cy:g}")
 
 
 def describe_capture(app: str, unit: str, pairs: Sequence[Pair], *, poses: bool) -> Assumption:
@@ -220,10 +214,10 @@ def describe_capture(app: str, unit: str, pairs: Sequence[Pair], *, poses: bool)
 
 
 def add_trajectory(folder: Path, found: PairingResult) -> PairingResult:
-    """Return the pairs of a folder with the poses of the trajectory of Open3D's reconstruction system, if it fits.
+    """Return the pairs of a folder with the poses of Open3D's trajectory, if it fits.
 
-    That is a line of three whole numbers and the four rows of the pose for each frame
-    (http://redwood-data.org/indoor/fileformat.html): the n-th pose, by the first of the three, is of the n-th photo.
+    It has a line of three whole numbers, the first of which orders the poses, and the four rows of each pose
+    (http://redwood-data.org/indoor/fileformat.html).
     """
     path = next((folder / name for name in _OPEN3D_FILES if (folder / name).is_file()), None)
     if path is None or not found.pairs:

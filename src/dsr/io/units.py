@@ -111,7 +111,6 @@ def _multiples(values: np.ndarray, step: int, share: float = _MOST) -> bool:
 
 
 def _interpret_whole(seen: _Map) -> Meaning:
-    """Return what whole numbers mean."""
     lowest = float(seen.values[~seen.holes].min())
     if lowest < seen.highest < _LEVELS and not seen.votes.verdict:
         raise ValueError(
@@ -205,7 +204,6 @@ def _by_median(seen: _Map) -> Meaning:
 
 
 def _interpret_floats(seen: _Map) -> Meaning:
-    """Return what floats mean."""
     middle = seen.middle
     if seen.conclusive:
         _expect_metric(seen)

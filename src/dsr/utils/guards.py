@@ -12,7 +12,7 @@ import os
 import re
 import stat
 import zipfile
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from difflib import get_close_matches
 from io import BufferedReader
 from numbers import Real
@@ -213,6 +213,14 @@ def numbers_in(words: Iterable[str]) -> list[float]:
         return [float(word) for word in words]
     except ValueError:
         return []
+
+
+def named_numbers(place: str, entries: Mapping[str, str], names: Iterable[str]) -> list[float]:
+    """Return the numbers of some names in a table; a message begins with ``place``."""
+    came = {name: entries.get(name, "nothing") for name in names}
+    if not (values := numbers_in(came.values())):
+        raise ValueError(f"{place}: expected numbers for {', '.join(came)}, got {', '.join(came.values()):.120}")
+    return values
 
 
 def split_numbers(text: str) -> list[str]:

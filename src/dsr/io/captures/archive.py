@@ -89,11 +89,7 @@ def _open(path: Path, _state: tuple[int, int]) -> zipfile.ZipFile:
 
 @functools.cache
 def unpack(path: Path, state: tuple[int, int]) -> Path:
-    """Return a temporary folder with the files of a ZIP file in a :func:`file_state`, deleted when the program ends.
-
-    A ValueError if it is damaged or encrypted, a member is a link or leads outside the folder, or they are larger than
-    the size of the archive explains.
-    """
+    """Return a folder with the files of a ZIP file in a :func:`file_state`, which the end of the program deletes."""
     packed = _open(path, state)
     inside = [each for each in files_in(packed, path) if not each.filename.startswith("__MACOSX/")]
     total = sum(each.file_size for each in inside)

@@ -152,12 +152,11 @@ def _files(path: Path, content: bytes, place: int, groups: list[_Values]) -> dic
         place += int.from_bytes(content[place : place + 2])
     files = dict[str, bytes]()
     for number, item in enumerate(each for each in groups if "Item:Mime" in each):
-        sizes = [item.get(name) or "0" for name in ("Item:Length", "Item:Padding")]
-        if not all(re.fullmatch(r"\d{1,12}", each, re.ASCII) for each in sizes):
-            raise ValueError(f"{path}: Item:Length, Item:Padding: expected bytes, got {', '.join(sizes)!r:.60}")
-        length = int(sizes[0]) if number else 0  # the first one is the photo
+        with refusing(f"{path}: Item:Length, Item:Padding: expected whole numbers, got others", ValueError):
+            length, padding = (max(int(item.get(name) or 0), 0) for name in ("Item:Length", "Item:Padding"))
+        length = length if number else 0  # the first one is the photo
         files[item.get("Item:DataURI", "")] = content[end : end + length]
-        end += length + int(sizes[1])
+        end += length + padding
     return files
 
 
