@@ -167,7 +167,7 @@ REFUSED = {
     "colours": (lambda path: captures.gdepth(path, captures.photo()), f"{PICTURE}, got uint8 of shape"),
     "segment lost": (changed(captures.gdepth, b"/xmp/extension/", b"/xmp/extensiom/"), "expected GDepth:Data"),
     "extension cut": (changed(captures.gdepth, b"/xmp/extension/", b"/xmp/extensiom/", 1, original=LARGE), "of XMP, "),
-    "length": (changed(captures.dynamic_depth, b'Length="', b'Length="-'), "Item:Length, Item:Padding: expected bytes"),
+    "length": (changed(captures.dynamic_depth, b'Length="', b'Length="x'), "Item:Length, Item:Padding: expected whole"),
     "beyond the end": (changed(captures.dynamic_depth, b'Length="', b'Length="9'), PICTURE),
     "no item": (changed(captures.dynamic_depth, b'DepthURI="android/', b'DepthURI="andromeda/'), PICTURE),
     "model": (changed(captures.dynamic_depth, b'LengthX="200"', b'LengthX="nan"', model=MODEL), "ImagingModel"),

@@ -120,10 +120,8 @@ def read_poses(path: Path) -> Trajectory:
     if lengths == {4} and len(rows) % 4 == 0:
         rows = np.reshape(rows, (-1, 16)).tolist()
     elif not timed and lengths not in ({12}, {16}):
-        text = "lines of 8 numbers (time, translation, quaternion), 9 (and an id), 12, 16 or four times 4 (a matrix)"
-        raise ValueError(
-            f"{path}: expected {text}, got lines of {', '.join(map(str, sorted(lengths))) or 'no'} numbers"
-        )
+        text = "lines of 8 numbers (time, translation, quaternion), 9 (and an id), 12, 16 or four times 4 (matrices)"
+        raise ValueError(f"{path}: expected {text}, got lines of {', '.join(map(str, sorted(lengths))) or 'none'}")
     poses: list[Matrix | None] = []
     for number, row in enumerate(rows, 1):
         numbers, place = row[1:8] if timed else row[:12], f"{path}: pose {number}"

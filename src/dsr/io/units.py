@@ -170,7 +170,6 @@ def _by_steps(seen: _Map) -> Meaning | None:
 
 
 def _whole(seen: _Map, label: str, unit: float, why: str) -> Assumption:
-    """Return the note on a unit of whole numbers."""
     return Assumption(f"whole numbers are read as {label}: {why}; {_OVERRIDE}", f"median {seen.metres(unit)}")
 
 
