@@ -92,8 +92,8 @@ def test_poses_are_read_in_every_format(tmp_path, content):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("", "got lines of no numbers"),
-        ("1 2\n", "got lines of 2 numbers"),
+        ("", "got lines of none"),
+        ("1 2\n", "got lines of 2"),
         (text(MATRIX)[:-40], "expected lines of 8 numbers"),
         (TUM.format(time=0).rsplit(" ", 1)[0] + " 3\n", "pose 1: expected a quaternion of length 1"),
         (TUM.format(time=0).replace("0.1", "nan", 1) + "\n", "expected poses of finite numbers"),
