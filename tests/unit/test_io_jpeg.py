@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 from captures import IMAGING_MODEL, encoded
+from upsampling import upsample
 
-from dsr.cli import main
-from dsr.io.depth_files import read_depth_file
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import NoPairError, find_pairs_of_folder
 from dsr.io.reading import Reading
@@ -105,10 +104,9 @@ def test_distances_along_the_rays_become_depth(tmp_path):
     ("units", "text"), [("", "may be relative, the file does not"), ("None", "is relative, as the")]
 )
 def test_depth_of_no_unit_is_said_to_be_relative(tmp_path, capsys, units, text):
-    path, out = captures.gdepth(tmp_path / "photo.jpg", LEVELS, Units=units), tmp_path / "out"
-    assert main(["upsample", str(path), "-o", str(out), "--method", "bicubic", "--only", "depth"]) == 0
+    path = captures.gdepth(tmp_path / "photo.jpg", LEVELS, Units=units)
+    assert upsample(path, "-o", tmp_path / "out", "--method", "bicubic", "--only", "depth") == 0
     assert f"the depth {text}" in capsys.readouterr().out
-    assert read_depth_file(out / "photo" / "depth_metres.tiff").shape == captures.HEIC
 
 
 def test_photo_with_an_orientation_lies_as_stored_and_its_focal_length_is_that_of_exif(tmp_path):
@@ -125,21 +123,22 @@ def test_photo_with_an_orientation_lies_as_stored_and_its_focal_length_is_that_o
 def test_photos_of_a_folder_are_read_unless_depth_maps_are_beside_them(tmp_path):
     for name in ("b", "a"):
         captures.gdepth(tmp_path / f"{name}.JPG", LEVELS)
-    captures.save(tmp_path / "plain.jpg", captures.photo())
+    plain = tmp_path / "plain.jpg"  # behind whose pixels is no XMP
+    plain.write_bytes(encoded(captures.photo(), ".jpg") + b"http://ns.google.com/photos/1.0/depthmap/")
     assert [pair.name for pair in find_pairs_of_folder(tmp_path).pairs] == ["a", "b"]
     captures.save(tmp_path / "a_depth.png", captures.millimetres())
     (pair,) = find_pairs_of_folder(tmp_path).pairs
     assert (pair.capture, pair.depth.name) == (None, "a_depth.png")
     with pytest.raises(NoPairError, match=r"plain\.jpg: expected a folder, or a file with depth as .*\.jpg"):
-        find_pairs_of_folder(tmp_path / "plain.jpg")
+        find_pairs_of_folder(plain)
 
 
-def test_of_a_plain_photo_nothing_from_its_pixels_on_is_read(tmp_path):
-    """A pixel row that names a depth map is no XMP."""
-    photo = encoded(captures.photo(), ".jpg") + b"http://ns.google.com/photos/1.0/depthmap/"
-    (tmp_path / "plain.jpg").write_bytes(photo)
-    with pytest.raises(NoPairError):
-        find_pairs_of_folder(tmp_path / "plain.jpg")
+def test_damaged_photo_of_a_folder_leaves_the_others(tmp_path, capsys):
+    captures.gdepth(tmp_path / "in" / "a.jpg", LEVELS)
+    REFUSED["segment lost"][0](tmp_path / "in" / "b.jpg")
+    assert upsample(tmp_path / "in", "-o", tmp_path / "out", "--method", "bicubic", "--only", "depth") == 2
+    assert (tmp_path / "out" / "a" / "depth_metres.tiff").is_file()
+    assert "b.jpg: expected GDepth:Data or DepthMap:DepthURI in the XMP" in capsys.readouterr().err
 
 
 def changed(write, old, new, count=-1, **options):

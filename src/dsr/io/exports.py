@@ -268,8 +268,7 @@ def write_stereo(path: Path, rgb: Tensor, depth: Tensor, camera: Camera) -> list
     """
     inverse, _ = _filled(depth[0].double().reciprocal().nan_to_num(-1.0).numpy())
     height, width = inverse.shape
-    nearest = max(float(np.quantile(inverse, _NEARLY_ALL)), 1e-9)
-    eyes = min(_EYES, width / (_MOST_SHIFT * camera.fx * nearest))
+    eyes = min(_EYES, width / (_MOST_SHIFT * camera.fx * max(np.quantile(inverse, _NEARLY_ALL), 1e-9)))
     shift = camera.fx * eyes * inverse
     rows, columns = np.mgrid[:height, :width]
     seen = torch.full((height * width,), -1.0, dtype=torch.float64)  # shifts; the nearest point hides others

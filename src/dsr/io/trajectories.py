@@ -163,7 +163,6 @@ def _numbers(path: Path, text: str) -> list[list[float]]:
 
 
 def _matrix_of_json(path: Path, text: str) -> list[list[float]]:
-    """Return the nested lists that JSON holds."""
     with refusing(f"{path}: expected JSON or rows of numbers, got something else", ValueError):
         content = parse_json(text)
     if isinstance(content, dict):

@@ -8,6 +8,7 @@ far. XMP is searched for properties and not parsed: Google's own example is no v
 """
 
 import base64
+import contextlib
 import re
 from collections.abc import Iterator
 from functools import partial
@@ -46,18 +47,20 @@ _Values = dict[str, str]  # properties by their names
 
 def read(path: Path) -> PairingResult:
     """Return the pair of a JPEG with a depth map."""
-    (_, _, confidence), found = _read(path)
+    confidence, found = b"", _Values()
+    with contextlib.suppress(ValueError):  # which is reported with the frame
+        (_, _, confidence), found = _read(path)
     model = {name: found[f"ImagingModel:{name}"] for name in _MODEL if f"ImagingModel:{name}" in found}
     names = ("Near", "Far", "Format", "Units", "MeasureType")
     values = {name: found.get(f"GDepth:{name}", found.get(f"DepthMap:{name}", "")).lower() for name in names}
     notes = accuracy_notes(absolute=values["Units"] in _METRES, stated=bool(values["Units"]))
     notes += [AS_STORED] if read_exif(path).orientation != 1 else []
-    decoders = {"photo": decode_photo, "depth": partial(_depth, path, values), "confidence": _grey}
-    photo, depth, sure = (
-        Part(path, name, partial(_fetch, path, place), decode) for place, (name, decode) in enumerate(decoders.items())
-    )
+    fetch = [partial(_fetch, path, place) for place in range(3)]
+    photo = Part(path, "photo", fetch[0], decode_photo)
+    depth = Part(path, "depth", fetch[1], partial(_depth, path, values))
     geometry = stated(_geometry, path, model, tuple(notes))
     frame = CaptureFrame("JPEG", geometry, path, repr((values, model)).encode(), photo, depth)
+    sure = Part(path, "confidence", fetch[2], _grey)
     known = ConfidenceMap(path / "confidence", 1.0, sure) if confidence else None
     ray = values["MeasureType"] == "opticray"
     pair = Pair(path.stem, path, path / "depth", unit=1.0, capture=frame, confidence=known, along_ray=ray)

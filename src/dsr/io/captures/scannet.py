@@ -109,7 +109,8 @@ def _read_header(path: Path, file: BufferedReader) -> _Sens:
     if colour not in (0, 1, 2) or depth not in (0, 1):
         raise ValueError(f"{path}: expected colour as 0, 1, 2, depth as 0, 1, got compression {colour} and {depth}")
     if not all(1 <= side <= _LARGEST_SIDE for side in (wide, high, narrow, low)) or not 1 <= scale <= 1e6:
-        raise ValueError(f"{path}: expected sizes and values per metre, got {wide}x{high}, {narrow}x{low}, {scale:g}")
+        got = f"{wide} x {high}, {narrow} x {low} and {scale:g}"
+        raise ValueError(f"{path}: expected sizes and values per metre, got {got}")
     numbers = [matrix[0], matrix[5], matrix[2], matrix[6]]
     return _Sens(numbers, (colour, depth), (high, wide), (low, narrow), scale, count)
 
