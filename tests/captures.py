@@ -1,5 +1,8 @@
 """Small captures in the layouts of apps, written with poses and intrinsics that are known."""
 
+import base64
+import hashlib
+import io
 import json
 import os
 import struct
@@ -678,6 +681,78 @@ def heic(path, levels, message=None, text="", orientation=1, reported=None):
     return path
 
 
+_XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+<rdf:Description rdf:about="" {}</rdf:Description></rdf:RDF></x:xmpmeta>"""
+
+
+def encoded(pixels, suffix=".png", **exif):
+    """A picture, grey or RGB, as the bytes of a PNG or JPEG."""
+    content = io.BytesIO()
+    Image.fromarray(pixels).save(content, {".png": "PNG", ".jpg": "JPEG"}[suffix], quality=98, **exif)
+    return content.getvalue()
+
+
+def with_xmp(photo, standard, extended="", swap=False):
+    """A JPEG with XMP in its first segments, of which the extended one may be in several, in another order."""
+    parts, size = [], 60_000
+    if extended:
+        guid = hashlib.md5(extended.encode()).hexdigest().upper()
+        standard = f'xmlns:xmpNote="http://ns.adobe.com/xmp/note/" xmpNote:HasExtendedXMP="{guid}" {standard}'
+        for place in range(0, len(extended), size):
+            head = guid.encode() + struct.pack(">II", len(extended), place)
+            parts.append(b"http://ns.adobe.com/xmp/extension/\0" + head + extended[place : place + size].encode())
+    parts = [b"http://ns.adobe.com/xap/1.0/\0" + _XMP.format(standard).encode(), *(parts[::-1] if swap else parts)]
+    return photo[:2] + b"".join(b"\xff\xe1" + struct.pack(">H", len(each) + 2) + each for each in parts) + photo[2:]
+
+
+def gdepth(path, levels, *, confidence=None, original=None, extended=True, swap=False, file=None, **values):
+    """Write a JPEG with GDepth: near and far are 0.5 and 4 m unless ``values`` say else, empty ones are left out."""
+    keys = {"Format": "RangeInverse", "Near": 0.5, "Far": 4.0, "Units": "m", "ImageWidth": 256, **values}
+    sure = b"" if confidence is None else encoded(confidence)
+    data = {"GDepth:Data": encoded(levels), "GDepth:Confidence": sure, "GImage:Data": original}
+    large = " ".join(f'{name}="{base64.b64encode(each).decode()}"' for name, each in data.items() if each)
+    names = 'xmlns:GDepth="http://ns.google.com/photos/1.0/depthmap/" '
+    names += " ".join(f'GDepth:{name}="{value}"' for name, value in keys.items() if value != "")
+    file = encoded(photo().repeat(4, 0).repeat(4, 1), ".jpg") if file is None else file
+    large = _XMP.format(f"{large}>") if extended else large
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(with_xmp(file, f"{names}>", large, swap) if extended else with_xmp(file, f"{names} {large}>"))
+    return path
+
+
+def dynamic_depth(path, levels, confidence=None, *, original=None, model="", padding=0, progressive=False, **values):
+    """Write a JPEG with Dynamic Depth, whose maps lie behind the photo, as Android writes it: all in extended XMP."""
+    photo_file = encoded(photo().repeat(4, 0).repeat(4, 1), ".jpg", progressive=progressive)
+    keys = {"Format": "RangeInverse", "Near": 0.5, "Far": 4.0, "Units": "Meters", "DepthURI": "android/depthmap",
+            **({} if confidence is None else {"ConfidenceURI": "android/confidencemap"}), **values}  # fmt: skip
+    items = {"android/mainimage": b"", "android/original": original, "android/depthmap": encoded(levels),
+             "android/confidencemap": None if confidence is None else encoded(confidence)}  # fmt: skip
+    items = {name: content for name, content in items.items() if content is not None}
+    directory = "".join(
+        f'<rdf:li rdf:parseType="Resource"><Container:Item Item:Mime="image/png" Item:Length="{len(content)}" '
+        f'Item:DataURI="{name}" Item:Padding="{padding}"/></rdf:li>' for name, content in items.items()
+    )  # fmt: skip
+    depth_map = " ".join(f'DepthMap:{name}="{value}"' for name, value in keys.items())
+    uri = "android/mainimage" if original is None else "android/original"
+    text = (
+        'xmlns:DepthMap="http://ns.google.com/photos/dd/1.0/depthmap/">'
+        f"<Device:Container><Container:Directory><rdf:Seq>{directory}</rdf:Seq></Container:Directory></Device:Container>"
+        f'<Device:Cameras><rdf:Seq><rdf:li><Device:Camera Camera:Trait="Physical"><Camera:Image Image:ItemURI="{uri}"/>'
+        f"<Camera:DepthMap {depth_map}/>{model}</Device:Camera></rdf:li></rdf:Seq></Device:Cameras>"
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    files = b"".join(content + bytes(padding) for content in items.values())
+    path.write_bytes(with_xmp(photo_file, ">", _XMP.format(text)) + files)
+    return path
+
+
+IMAGING_MODEL = (
+    '<Camera:ImagingModel ImagingModel:FocalLengthX="200" ImagingModel:FocalLengthY="201" '
+    'ImagingModel:ImageWidth="256" ImagingModel:ImageHeight="192" ImagingModel:PrincipalPointX="{}" '
+    'ImagingModel:PrincipalPointY="{}"/>'
+)
+
+
 def zed(folder, fx=700.0, **changes):
     """Write pictures of a ZED at 1280 x 720 as its SDK exports them, without distortion and already side by side."""
     for number in range(FRAMES):
@@ -734,6 +809,12 @@ FOLDERS = {
     "ros 2 packed": lambda folder: ros(folder / "recording", 2, packed=True),
     "ros 2 mcap": lambda folder: ros(folder / "recording", 2, plugin="MCAP"),
     "kinect": lambda folder: kinect(folder / "scan.mkv", [photo()] * 2, [np.full(KINECT_DEPTH, 1000, np.uint16)] * 2),
+    "gdepth": lambda folder: gdepth(
+        folder / "photo.jpg", np.full(HEIC_MAP, 99, np.uint8), confidence=np.full(HEIC_MAP, 200, np.uint8)
+    ),
+    "dynamic depth": lambda folder: dynamic_depth(
+        folder / "photo.jpg", np.full(HEIC_MAP, 99, np.uint8), model=IMAGING_MODEL.format(0.5, 0.5)
+    ),
     "heic": lambda folder: heic(folder / "photo.heic", np.full(HEIC_MAP, 99, np.uint8), text=apple_text()),
 }
 """What writes each kind of capture into a folder."""

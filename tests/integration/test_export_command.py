@@ -25,11 +25,11 @@ def names_in(folder):
 def test_exports_are_written_beside_the_frames_and_again_after_a_resumption(capture, tmp_path, capsys):
     out, poses = tmp_path / "out", tmp_path / "poses.txt"
     poses.write_text("".join(f"{number} {number} 0 0 0 0 0 1\n" for number in range(2)))
-    assert upsample(capture, "--poses", poses, "--only", "open3d", "-o", out) == 0
+    assert upsample(capture, "--poses", poses, "--only", "open3d,stereo,rgbd_picture", "-o", out) == 0
     said = capsys.readouterr().out
     assert f"open3d: 2 frames -> {out / 'open3d'}" in said
     frame = {"info.json", "depth.png", "depth_metres.tiff", "rgbd/color.png", "rgbd/depth.png", "rgbd/intrinsic.json"}
-    assert names_in(out / "000") == frame
+    assert names_in(out / "000") == {*frame, "stereo_2x1.jpg", "rgbd_2x1.png"}
     assert upsample(capture, "--poses", poses, "--only", "open3d,nerfstudio,gaussian", "-o", out) == 0
     assert "2 complete already" in capsys.readouterr().out
     assert "open3d/trajectory.log" in names_in(out)

@@ -76,4 +76,4 @@ def test_confidence_that_does_not_fit_is_refused_in_one_line(lists, capsys):
     assert (lists / "out" / "1" / "depth.png").is_file()
     (lists / "sure" / "confidence_001.png").unlink()
     message = refused_line(capsys, upsample(*given, *sure, "--min-confidence", 0.5))
-    assert "expected a map for each of the 2 depth maps, there is none for 1, such as 1" in message
+    assert "expected 2 maps, there is none for 1 depth maps, such as 1" in message

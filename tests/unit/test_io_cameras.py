@@ -78,7 +78,7 @@ def test_camera_of_another_resolution_is_scaled_about_the_outer_edge(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("c.json", {**OWN, "width": 80}, "another aspect"),
+        ("c.json", {**OWN, "width": 80}, "expected a camera of the photo's aspect"),
         ("c.json", {**OWN, "fx": "wide"}, "fx: expected a valid number, got 'wide'"),
         ("c.json", {**OPEN3D, "intrinsic_matrix": [1, 2]}, "intrinsic_matrix: expected at least 9 items"),
         ("c.json", {**OPEN3D, "intrinsic_matrix": [True] * 9}, "intrinsic_matrix.0: expected a valid number, got True"),

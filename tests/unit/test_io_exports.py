@@ -22,6 +22,8 @@ from dsr.io.exports import (
     write_mesh,
     write_normals,
     write_renderings,
+    write_rgbd_picture,
+    write_stereo,
 )
 
 CAMERA = Camera(24, 18, 30, 30, 11.5, 8.5)
@@ -245,3 +247,42 @@ def test_input_is_read_back(stored):
 def test_large_photos_are_stored_smaller(tmp_path):
     write_input(tmp_path / "input.npz", torch.rand(3, 30, 2 * LONGEST), torch.ones(1, 2, 2))
     assert read_input(tmp_path / "input.npz")[0].shape == (15, LONGEST, 3)
+
+
+def views(path, rgb, depth, camera):
+    notes = write_stereo(path, rgb, depth, camera)
+    return *np.split(read(path).astype(float), 2, axis=1), notes[0].detail
+
+
+@pytest.mark.parametrize(("metres", "apart"), [(2.0, 0.063), (0.5, 0.025)])
+def test_right_view_of_a_wall_is_shifted_by_focal_length_times_distance_over_depth(tmp_path, metres, apart):
+    """Of the near wall 1/30 of the width, 15 pixels."""
+    camera = Camera(450, 40, 300, 300, 224.5, 19.5)
+    shift = 300 * apart / metres
+    waves = [0.5 + 0.4 * np.sin((np.arange(450) + each) / 5) for each in (0, shift)]
+    rgb = torch.from_numpy(waves[0]).expand(3, 40, 450)
+    left, right, detail = views(tmp_path / "a.jpg", rgb, torch.full((1, 40, 450), metres), camera)
+    assert detail == f"{1000 * apart:g} mm"
+    np.testing.assert_allclose(left, np.broadcast_to(255 * waves[0][:, None], left.shape), atol=3)
+    np.testing.assert_allclose(right[:, :432], np.broadcast_to(255 * waves[1][:432, None], (40, 432, 3)), atol=4)
+
+
+def test_near_things_hide_others_and_what_they_uncover_is_background(tmp_path):
+    camera = Camera(450, 40, 300, 300, 224.5, 19.5)
+    depth, rgb = torch.full((1, 40, 450), 1e6), torch.zeros(3, 40, 450)
+    rgb[1], depth[..., 200:280], rgb[:, :, 200:280] = 1, 300 * 0.063 / 15, torch.tensor([1.0, 0, 0])[:, None, None]
+    depth[:, 5:9, 100:230] = torch.nan  # behind what is beside it: the background
+    right = views(tmp_path / "a.jpg", rgb, depth, camera)[1]
+    red = (right[..., 0] > right[..., 1])[20:30]
+    assert np.argwhere(red.all(0)).ravel().tolist() == [*range(185, 265)]
+    assert red.any(0).sum() == 80
+    assert (right[20:30, 268:, 1] > 220).all()
+
+
+def test_rgbd_picture_has_inverse_depth_from_black_to_white_and_holes_are_as_far_as_what_is_behind_them(tmp_path):
+    depth = torch.tensor([1.0, 1.0, torch.nan, torch.nan, 2.0, 4.0]).repeat_interleave(4).expand(1, 18, 24)
+    write_rgbd_picture(tmp_path / "a.png", photo(), depth, CAMERA)
+    picture = read(tmp_path / "a.png")
+    np.testing.assert_allclose(picture[:, :24], 255 * photo().permute(1, 2, 0), atol=0.51)
+    grey = np.repeat([255, 255, 85, 85, 85, 0], 4)
+    np.testing.assert_array_equal(picture[:, 24:], np.broadcast_to(grey[:, None], (18, 24, 3)))

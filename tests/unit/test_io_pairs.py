@@ -156,7 +156,7 @@ def test_inconsistent_lists_are_refused(tmp_path):
         ([one], [two], [two, two], "1 for --depth, 2 for --mask"),
         ([one], [tmp_path / "none.png"], [], "--depth: .*none.png: no such file"),
         ([one], [tmp_path / "depth"], [], "expected files, or one folder each"),
-        ([tmp_path / "rgb"], [tmp_path / "rgb"], [], "expected two folders; one that holds both is given without"),
+        ([tmp_path / "rgb"], [tmp_path / "rgb"], [], "expected two folders; one with both is given without"),
         ([tmp_path / "rgb"], [tmp_path / "depth"], [], "of 2 and 2 none belong together"),
         ([tmp_path / "rgb"], [tmp_path / "depth"], [two], "--mask: expected photos and depth maps as files"),
     ]:

@@ -92,8 +92,8 @@ def test_poses_are_read_in_every_format(tmp_path, content):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("", "got lines of no numbers"),
-        ("1 2\n", "got lines of 2 numbers"),
+        ("", "got lines of none"),
+        ("1 2\n", "got lines of 2"),
         (text(MATRIX)[:-40], "expected lines of 8 numbers"),
         (TUM.format(time=0).rsplit(" ", 1)[0] + " 3\n", "pose 1: expected a quaternion of length 1"),
         (TUM.format(time=0).replace("0.1", "nan", 1) + "\n", "expected poses of finite numbers"),
@@ -196,5 +196,5 @@ def test_numbers_in_names_suit_more_frames_than_a_time_that_is_one_by_chance(tmp
 
 def test_poses_without_times_have_to_be_as_many_as_frames(tmp_path):
     (tmp_path / "poses.txt").write_text(text(MATRIX))
-    with pytest.raises(ValueError, match="a pose for each of the 2 frames"):
+    with pytest.raises(ValueError, match="poses for 2 frames"):
         read_poses(tmp_path / "poses.txt").assign(pairs("a", "b"))

@@ -191,5 +191,5 @@ def test_images_of_ros_have_their_channels_in_order_and_may_have_padded_rows(enc
     message = SimpleNamespace(encoding=encoding, data=rows.reshape(-1), **about)
     np.testing.assert_array_equal(decode_message(message), captures.photo())
     message.height += 1
-    with pytest.raises(ValueError, match=r"^expected an image of 64 x 49 pixels in rows of \d+ bytes, got"):
+    with pytest.raises(ValueError, match=r"^expected an image of 64 x 49 in rows of \d+ bytes, got"):
         decode_message(message)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AliasChoices, BaseModel, BeforeValidator, Field
+from pydantic import AliasChoices, BaseModel, BeforeValidator, Field, model_validator
 from torch import Tensor
 
 from dsr.geometry.camera import ASSUMED_FOV, Camera, RangeType, expect_intrinsics
@@ -42,10 +42,7 @@ class CameraFile:
 
 
 def find_camera(choice: CameraChoice, photo: Path, size: Size, size_lr: Size) -> tuple[CameraFile, list[Assumption]]:
-    """Return the camera of a photo's pixels, with the depth encoding from its file, and the assumptions.
-
-    ``size_lr`` is the size of the depth map, to which a matrix without an image size may belong.
-    """
+    """Return the camera of a photo's pixels, with the depth encoding from its file, and the assumptions."""
     height, width = size
     if choice.file is not None:
         return _fit_to_photo(choice.file, read_any_camera(choice.file), size, size_lr, photo)
@@ -107,11 +104,8 @@ def read_camera(path: Path) -> CameraFile:
 
 
 def _of_json(path: Path, text: str) -> CameraFile:
-    """Return the content of a ``camera.json`` of dsr, or a ``cam_params.json`` as NICE-SLAM's data sets have it."""
     if '"camera"' in text or any(f'"{name}"' in text for name in _SCALES):
-        params = (
-            parse_model(_NestedParams, text, path).camera if '"camera"' in text else parse_model(_Params, text, path)
-        )
+        params = parse_model(_Params, text, path)
         with naming(path):
             camera = Camera(params.w, params.h, params.fx, params.fy, params.cx, params.cy)
         return CameraFile(camera, depth_unit=None if params.scale is None else 1 / params.scale)
@@ -164,11 +158,9 @@ class _Params(BaseModel, strict=True):
     cy: _Number
     scale: Annotated[_Number, Field(ge=1)] | None = Field(None, validation_alias=AliasChoices(*_SCALES))
 
-
-class _NestedParams(BaseModel, strict=True):
-    """The same under the key ``camera``."""
-
-    camera: _Params
+    _unwrap = model_validator(mode="before")(
+        lambda entries: entries.get("camera", entries) if isinstance(entries, dict) else entries
+    )
 
 
 class _Open3d(BaseModel, strict=True):
@@ -191,13 +183,19 @@ def _fit_to_photo(
     if across and pixels_in_header(photo) != size:
         orientation = read_exif(photo).orientation
     if orientation >= 5:  # the photo is turned, the camera is that of the sensor
-        cx = camera.height - 1 - camera.cy if orientation in (6, 7) else camera.cy
-        cy = camera.width - 1 - camera.cx if orientation in (7, 8) else camera.cx
-        turned = replace(camera, width=camera.height, height=camera.width, fx=camera.fy, fy=camera.fx, cx=cx, cy=cy)
-        content = replace(content, camera=turned)
+        content = replace(content, camera=turn_camera(camera, orientation))
         assumptions.append(Assumption("camera: turned as the photo is by its EXIF data"))
     content, scaled = scale_to_photo(path, content, size)
     return content, [*assumptions, *scaled]
+
+
+def turn_camera(camera: Camera, orientation: int) -> Camera:
+    """Return the camera of a picture that is turned as an EXIF orientation says."""
+    cx = camera.width - 1 - camera.cx if orientation in (2, 3, 7, 8) else camera.cx
+    cy = camera.height - 1 - camera.cy if orientation in (3, 4, 6, 7) else camera.cy
+    if orientation < 5:
+        return replace(camera, cx=cx, cy=cy)
+    return replace(camera, width=camera.height, height=camera.width, fx=camera.fy, fy=camera.fx, cx=cy, cy=cx)
 
 
 def scale_to_photo(path: Path, content: CameraFile, size: Size) -> tuple[CameraFile, list[Assumption]]:
@@ -213,10 +211,8 @@ def scale_camera(place: object, camera: Camera, size: Size, whose: str = "depth 
     """Return a camera scaled to a picture's (height, width); a message begins with ``place``."""
     height, width = size
     if not same_aspect((camera.height, camera.width), size):
-        raise ValueError(
-            f"{place}: the camera is of {camera.width} x {camera.height} pixels (width x height), the {whose} has "
-            f"{width} x {height}, another aspect"
-        )
+        got = f"{camera.width} x {camera.height} (width x height)"
+        raise ValueError(f"{place}: expected a camera of the {whose}'s aspect, {width} x {height}, got {got}")
     return camera.rescale(width, height)
 
 
@@ -230,10 +226,8 @@ def _camera_of_matrix(path: Path, matrix: np.ndarray, size: Size, size_lr: Size)
         if may_be_of(cx, cy, width, height):
             camera = Camera(width, height, matrix[0, 0], matrix[1, 1], cx, cy)
             return CameraFile(camera), [Assumption(f"camera: the matrix is read in pixels of the {name}")]
-    raise ValueError(
-        f"{path}: expected a principal point near the middle of the photo, {size[1]} x {size[0]} pixels (width x "
-        f"height), or of the depth map, {size_lr[1]} x {size_lr[0]}; got {cx:g}, {cy:g}"
-    )
+    text = f"the photo, {size[1]} x {size[0]} (width x height), or of the depth map, {size_lr[1]} x {size_lr[0]}"
+    raise ValueError(f"{path}: expected a principal point near the middle of {text}; got {cx:g}, {cy:g}")
 
 
 def _of_yaml(path: Path, text: str) -> CameraFile:

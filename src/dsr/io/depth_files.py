@@ -208,10 +208,7 @@ def decode(values: np.ndarray, holes: np.ndarray, encoding: Encoding, camera: Ca
 
 
 def encode(depth: Tensor, encoding: Encoding, camera: Camera) -> tuple[np.ndarray, int]:
-    """Return the values that a file stores, and the number of valid pixels outside their range, which become holes.
-
-    Whole numbers are rounded to the nearest. ``depth``: (1, H, W) orthogonal in metres, NaN in holes.
-    """
+    """Return the stored values of orthogonal depth, (1, H, W) in metres, and how many pixels are beyond their range."""
     values = to_range(depth.double(), camera, encoding.range_type)[0].cpu().numpy() / encoding.unit
     dtype, known = np.dtype(encoding.dtype), np.isfinite(values)
     if dtype.kind in "iu":

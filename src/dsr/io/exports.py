@@ -21,11 +21,13 @@ from dsr.geometry.lights import LIGHT_NAMES
 from dsr.geometry.mesh import QUADRIC, project, select_points, simplify, thin, triangulate, vertex_normals
 from dsr.geometry.surface import depth_to_normals, render
 from dsr.io.photos import encode_png, to_jpeg, write_png
+from dsr.notes import Assumption
 from dsr.sample import expect_distances
 from dsr.utils.arrays import read_arrays
 from dsr.utils.decoding import decode_pixels
 from dsr.utils.files import replacing
 from dsr.utils.guards import MOST_FACES, MOST_POINTS
+from dsr.utils.progress import show_length
 from dsr.utils.versions import how_to_install
 
 FLAT = "large triangles where the surface is flat"  # which makes a mesh smaller without a limit
@@ -40,6 +42,10 @@ _FINEST = 4e-4  # of the distance of the nearest point: largest step between pos
 _LARGEST_TEXTURE = 4096  # pixels of a side, which every viewer supports
 _LOSSLESS = 2**16  # pixels of a texture that is stored without loss
 _QUALITY = 95  # of a JPEG with colours at half the resolution: at full resolution it takes 6 to 34 % more
+_LARGEST_JPEG = 65535  # pixels of a side
+_EYES = 0.063  # metres between a person's eyes (Dodgson, 2004)
+_MOST_SHIFT = 30
+_NEARLY_ALL = 0.999  # of the pixels, without which a wrong one would decide
 _TYPES = {"int8": 5120, "uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
 _ATTRIBUTES, _INDICES = 34962, 34963
 
@@ -263,6 +269,60 @@ def write_glb(
     })  # fmt: skip
     with replacing(path) as temporary:
         temporary.write_bytes(content)
+
+
+def write_stereo(path: Path, rgb: Tensor, depth: Tensor, camera: Camera) -> list[Assumption]:
+    """Write a JPEG of the photo and, at its right, what the right eye sees; return a note on the distance of the eyes.
+
+    That is 63 mm, or less if the nearest points would be shifted by more than 1/30 of the width, a rule of stereo
+    photography. Points at depth Z are shifted by f * distance / Z. What the photo does not show, and holes of the
+    depth, (1, H, W) in metres, continue what is behind them.
+    """
+    inverse, _ = _filled(depth[0].double().reciprocal().nan_to_num(-1.0).numpy())
+    height, width = inverse.shape
+    eyes = min(_EYES, width / (_MOST_SHIFT * camera.fx * max(np.quantile(inverse, _NEARLY_ALL), 1e-9)))
+    shift = camera.fx * eyes * inverse
+    rows, columns = np.mgrid[:height, :width]
+    seen = torch.full((height * width,), -1.0, dtype=torch.float64)  # shifts; the nearest point hides others
+    pure = cv2.dilate(shift, np.ones((1, 5), np.uint8)) < shift + 1  # not coloured by what is in front of it
+    for target in (np.floor(columns - shift), np.ceil(columns - shift)):  # both, so that slopes have no gaps
+        shown = pure & (target >= 0)
+        places = torch.from_numpy((rows * width + target).astype(np.int64)[shown])
+        seen.scatter_reduce_(0, places, torch.from_numpy(shift[shown]), "amax")
+    shifts, behind = _filled(seen.view(height, width).numpy())
+    source = (2 * behind - columns + shifts).clip(0, width - 1)  # mirrored at the edge of a gap
+    nearer = np.take_along_axis(shift, source.round().astype(np.int64), 1) >= shifts + 1
+    source = np.where(nearer, behind + shifts, source)
+    photo = as_bytes(rgb).transpose(1, 2, 0)
+    maps = source.astype(np.float32), rows.astype(np.float32)
+    right = cv2.remap(photo, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    with replacing(path) as temporary:
+        temporary.write_bytes(to_jpeg(np.hstack((photo, right)), _LARGEST_JPEG, _QUALITY))
+    return [Assumption("the views of the stereo picture are apart", show_length(eyes))]
+
+
+def write_rgbd_picture(path: Path, rgb: Tensor, depth: Tensor, _camera: Camera) -> list[Assumption]:
+    """Write a PNG of the photo and, at its right, its inverse depth as grey from far, black, to near, white.
+
+    Holes of the depth, (1, H, W) in metres, continue what is behind them.
+    """
+    inverse, _ = _filled(depth[0].double().reciprocal().nan_to_num(-1.0).numpy())
+    far, near = np.quantile(inverse, (1 - _NEARLY_ALL, _NEARLY_ALL))
+    grey = as_bytes(torch.from_numpy((inverse - far) / max(near - far, np.finfo(float).tiny)))
+    photo = as_bytes(rgb.flip(0)).transpose(1, 2, 0)
+    write_png(path, np.hstack((photo, np.dstack((grey,) * 3))))
+    return []
+
+
+def _filled(inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return inverse depth, (H, W), with what is behind its holes, the values below 0, and the column of that."""
+    columns = np.broadcast_to(np.arange(inverse.shape[1]), inverse.shape)
+    left = np.maximum.accumulate(np.where(inverse >= 0, columns, 0), 1)
+    right = np.minimum.accumulate(np.where(inverse >= 0, columns, columns[0, -1])[:, ::-1], 1)[:, ::-1]
+    sides = np.stack([np.take_along_axis(inverse, each, 1) for each in (left, right)])
+    first, second = np.where(sides < 0, np.inf, sides)
+    behind = np.where(first < second, left, right)
+    return np.take_along_axis(inverse, behind, 1).clip(0), behind
 
 
 class _Glb:

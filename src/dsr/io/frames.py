@@ -17,7 +17,7 @@ from dsr.geometry.poses import Matrix
 from dsr.io.depth_files import DEPTH_SUFFIXES
 from dsr.io.images import Size, read_array
 from dsr.notes import Assumption
-from dsr.utils.guards import naming, pixels_beside
+from dsr.utils.guards import expect_size, naming, pixels_beside
 from dsr.utils.versions import hash_once
 
 Record = dict[str, str | int]  # identifies an input in info.json: name, SHA-256, and a frame's number if it has one
@@ -30,10 +30,7 @@ _Arguments = ParamSpec("_Arguments")
 
 @dataclass(frozen=True)
 class Source:
-    """A photo or a map inside a file: a frame of a video, a member of an archive, a message of a recording.
-
-    Other processes get it pickled and read the file anew.
-    """
+    """A photo or a map inside a file, such as a frame of a video; other processes get it pickled and read it anew."""
 
     file: Path
     name: str  # within the file
@@ -49,10 +46,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Part(Source):
-    """Bytes of a file that ``fetch`` returns, and of which ``decode`` makes pixels; its errors need not name the file.
-
-    Both are functions of modules or partial ones, as other processes get them.
-    """
+    """Bytes of a file that ``fetch`` returns, and of which ``decode`` makes pixels; both can be pickled."""
 
     fetch: Callable[[], bytes]
     decode: Callable[[bytes], np.ndarray]
@@ -101,6 +95,12 @@ def stated(read: Callable[_Arguments, Geometry], *args: _Arguments.args, **kwarg
         return Geometry(damage=str(error))
 
 
+def accuracy_notes(*, absolute: bool, stated: bool) -> list[Assumption]:
+    """Return a note on depth that a photo's file does not state to be absolute, if it states anything."""
+    known = "is relative, as the file states" if stated else "may be relative, the file does not say"
+    return [] if absolute else [Assumption(f"the depth {known}: sizes and distances mean little")]
+
+
 @dataclass(frozen=True)
 class CaptureFrame:
     """What a capture states of one frame.
@@ -145,11 +145,7 @@ class ConfidenceMap:
     def read(self, size: Size) -> np.ndarray:
         """Return the confidence of a depth map of (h, w), float32 from 0 to 1."""
         values = _read_values(self.path, pixels_beside(*size)) if self.source is None else self.source.read()
-        if values.shape != size:
-            raise ValueError(
-                f"{self.path}: expected confidence of the depth map's {size[1]} x {size[0]} pixels (width x height), "
-                f"got {values.shape[1]} x {values.shape[0]}"
-            )
+        expect_size(f"{self.path}: expected confidence of the depth map's", values, size)
         outside = values[~((values >= 0) & (values <= self.highest))]
         if outside.size:
             raise ValueError(f"{self.path}: expected confidence from 0 to {self.highest:g}, got {outside[0]}")

@@ -81,9 +81,7 @@ def read_values(path: Path, most: int | None = None) -> np.ndarray:
     if values.ndim != 2:
         raise ValueError(f"{path}: expected one channel (height x width), got shape {values.shape}{what}")
     if values.dtype.kind not in "fiu" or (values.dtype.kind in "iu" and values.dtype.itemsize == 1):
-        raise ValueError(
-            f"{path}: expected 16-bit or floating point values, got {values.dtype} (too coarse for depth){what}"
-        )
+        raise ValueError(f"{path}: expected 16 bits or floats, got {values.dtype} (too coarse for depth){what}")
     return values
 
 
@@ -140,7 +138,6 @@ def read_numbers(path: Path, count: int) -> np.ndarray:
 
 
 def _content(path: Path) -> bytes:
-    """Return what is in a picture file."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a picture, there is none")
     return read_limited(path, MOST_FILE)
@@ -208,7 +205,6 @@ def _read_exr(path: Path) -> np.ndarray:
 
 
 def _depth_channel(path: Path, channels: Iterable[str]) -> str:
-    """Return which channel holds depth."""
     last = {name: name.rpartition(".")[2].lower() for name in sorted(channels)}
     for wanted in ("z", "depth", "y"):
         found = [name for name, short in last.items() if short == wanted]

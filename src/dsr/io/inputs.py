@@ -42,7 +42,7 @@ from dsr.io.trajectories import read_transform
 from dsr.io.units import TURNED_BACK, Meaning, expect_narrow, interpret
 from dsr.notes import LIMITS, Assumption
 from dsr.sample import FARTHEST, NEAREST
-from dsr.utils.guards import natural_key, pixels_beside
+from dsr.utils.guards import expect_size, natural_key, pixels_beside
 from dsr.utils.progress import show_length
 
 _Kind = tuple[Path, str, str, bool]  # folder, suffix, type of value, and whether disparities were ruled out
@@ -132,11 +132,7 @@ def read_picture(pair: Pair, reading: Reading, units: FolderUnits | None = None)
     notes += [*values.notes, *values.hole_notes]
     if pair.mask is not None:
         mask = read_mask(pair.mask, pixels_beside(*size_lr))
-        if mask.shape != size_lr:
-            raise ValueError(
-                f"{pair.mask}: expected a mask of the depth map's {size_lr[1]} x {size_lr[0]} pixels (width x height), "
-                f"got {mask.shape[1]} x {mask.shape[0]}"
-            )
+        expect_size(f"{pair.mask}: expected a mask of the depth map's", mask, size_lr)
         holes |= ~mask
     confidence, confident = _confidence(pair, reading, size_lr, holes)
     expect_known(pair.depth, stored, holes)
@@ -247,7 +243,6 @@ def _interpret(
 
 
 def _stored(pair: Pair) -> np.ndarray:
-    """Return the depth map of a pair as it is stored, (h, w)."""
     if pair.capture is not None and pair.capture.depth is not None:
         return pair.capture.depth.read()
     photo = pixels_in_header(pair.rgb)
@@ -268,7 +263,6 @@ def _expect_distances(path: Path, depth_lr: Tensor, holes: np.ndarray, range_typ
 
 
 def _is_icl(pair: Pair) -> bool:
-    """Return whether the depth map is a text file of ICL-NUIM."""
     return pair.capture is None and pair.depth.suffix.lower() == ICL_SUFFIX
 
 
@@ -326,10 +320,8 @@ def _expect_lower_resolution(pair: Pair, size: Size, size_lr: Size) -> None:
     if low > height or narrow > width:
         raise ValueError(f"{pair.depth}: expected no more pixels than the photo, got {narrow} x {low}; {what}")
     if not same_aspect(size, size_lr) and abs(low - height * narrow / width) >= 1:
-        raise ValueError(
-            f"{pair.depth}: expected the photo's aspect and field of view, got {narrow} x {low}; {what}: "
-            "crop the one that sees more"
-        )
+        text = f"the photo's aspect and field of view, got {narrow} x {low}; {what}: crop the one that sees more"
+        raise ValueError(f"{pair.depth}: expected {text}")
     if low < 2 or narrow < 2:
         raise ValueError(f"{pair.depth}: expected at least 2 x 2 pixels, got {narrow} x {low}")
 
@@ -382,10 +374,8 @@ def _to_photo(
     notes += doubt_camera(rig.camera, "--depth-camera" if given else "depth camera")
     warped = warp_depth(depth_lr[None], rig.camera, torch.from_numpy(rig.transform)[None], target)[0]
     if not bool(warped.isfinite().any()):
-        raise ValueError(
-            f"{'--extrinsics' if given else _camera_source(pair, reading)}: expected the transform from the depth "
-            "camera's frame to the photo camera's, in metres; with this one the photo shows nothing of the depth map"
-        )
+        text = "the transform from the depth camera's frame to the photo camera's, in metres; the photo shows nothing"
+        raise ValueError(f"{'--extrinsics' if given else _camera_source(pair, reading)}: expected {text} of the depth")
     if given:
         inverse = torch.from_numpy(np.linalg.inv(rig.transform))[None]
         other = warp_depth(depth_lr[None], rig.camera, inverse, target)[0]
@@ -418,6 +408,8 @@ def _range_type(pair: Pair, reading: Reading, described: CameraFile) -> tuple[Ra
     if _is_icl(pair):
         text = "values are distances along the rays in centimetres, as in ICL-NUIM's .depth"
         return "perspective", [Assumption(text)]
+    if pair.along_ray:
+        return "perspective", [Assumption("values are distances along the rays, as the file states")]
     if described.range_type in (None, "orthogonal"):
         return described.range_type, []
     return described.range_type, [Assumption(f"values are of range type {described.range_type}, by the camera file")]

@@ -70,7 +70,7 @@ def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResu
     if folder.is_file():
         found = find_capture(folder)
         if found is None:
-            raise NoPairError(f"{folder}: expected a folder, or a capture as {', '.join(CAPTURE_FILES)}")
+            raise NoPairError(f"{folder}: expected a folder, or a file with depth as {', '.join(CAPTURE_FILES)}")
     elif folder.is_dir():
         found = _search(folder, None if leave is None else leave.resolve())
     else:
@@ -125,7 +125,8 @@ def _find_in(folder: Path, root: Path) -> PairingResult:
         if found.pairs:
             break
     else:
-        return add_transforms(folder, PairingResult(())) or find_colmap(folder) or found
+        listed = add_transforms(folder, PairingResult(())) or find_colmap(folder)
+        return listed or find_capture(folder, last=True) or found
     camera = find_camera_file(folder, root)
     if camera is not None:
         found = replace(found, pairs=tuple(replace(pair, camera=pair.camera or camera) for pair in found.pairs))
@@ -237,7 +238,6 @@ def _role_folders(folder: Path) -> PairingResult:
 
 
 def _side_by_side(folder: Path) -> PairingResult:
-    """Return the pairs among the files of a folder."""
     roles = {path: role_of(path) for path in list_pictures(folder)}
     photos = [path for path, role in roles.items() if role == "rgb"]
     depths = [path for path, role in roles.items() if role == "depth"]

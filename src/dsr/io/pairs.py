@@ -169,6 +169,7 @@ class Pair:
     confidence: ConfidenceMap | None = field(default=None, compare=False)
     bits: int = 0  # how far the layout turns values of 16 bits to the left; the unit holds after turning them back
     time: float | None = None  # of the photo in seconds, if the capture or a list of the files states it
+    along_ray: bool = False  # whether the layout's values are distances along the rays
 
     @property
     def named_time(self) -> float | None:
@@ -194,9 +195,7 @@ def find_pairs_of_lists(photos: Sequence[Path], depths: Sequence[Path], masks: S
                 raise ValueError(f"{name}: {path}: no such file or folder")
     if len(photos) == len(depths) == 1 and photos[0].is_dir() and depths[0].is_dir():
         if photos[0].samefile(depths[0]):
-            raise ValueError(
-                f"{photos[0]}: expected two folders; one that holds both is given without --rgb and --depth"
-            )
+            raise ValueError(f"{photos[0]}: expected two folders; one with both is given without --rgb and --depth")
         return find_pairs_of_two_folders(photos[0], depths[0], masks)
     for path in (*photos, *depths, *masks):
         if path.is_dir():
@@ -221,10 +220,8 @@ def find_pairs_of_two_folders(photos: Path, depths: Path, masks: Sequence[Path])
     right = [path for path in list_pictures(depths) if path.suffix.lower() in READ_SUFFIXES]
     found = match_pairs(left, right, find_camera_file(photos, photos.parent))
     if not found.pairs:
-        raise ValueError(
-            f"{photos} and {depths}: expected photos and depth maps of the same names, numbers or times (within 20 "
-            f"ms); of {len(left)} and {len(right)} none belong together"
-        )
+        text = f"the same names, numbers or times (within 20 ms); of {len(left)} and {len(right)} none belong together"
+        raise ValueError(f"{photos} and {depths}: expected photos and depth maps of {text}")
     return found
 
 
@@ -250,14 +247,10 @@ def add_confidence(pairs: Sequence[Pair], given: Sequence[Path]) -> tuple[Pair, 
         found = [maps.get(key_of(pair.depth)) or maps.get(key_of(pair.rgb)) for pair in pairs]
         paths = [path for path in found if path is not None]
         if missing := [pair.name for pair, path in zip(pairs, found, strict=True) if path is None]:
-            raise ValueError(
-                f"--confidence: {given[0]}: expected a map for each of the {len(pairs)} depth maps, there is none for "
-                f"{len(missing)}, such as {missing[0]}"
-            )
+            text = f"expected {len(pairs)} maps, there is none for {len(missing)} depth maps, such as {missing[0]}"
+            raise ValueError(f"--confidence: {given[0]}: {text}")
     elif any(path.is_dir() for path in given) or len(given) != len(pairs):
-        raise ValueError(
-            f"--confidence: expected a folder, or as many maps as photos, got {len(given)} for {len(pairs)} photos"
-        )
+        raise ValueError(f"--confidence: expected a folder or as many maps as photos, {len(pairs)}, got {len(given)}")
     else:
         paths = list(given)
     highest = find_highest(paths)

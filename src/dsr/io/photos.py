@@ -24,6 +24,7 @@ from dsr.utils.guards import MOST_FILE, expect_pixels, opened, read_limited, ref
 from dsr.utils.versions import how_to_install
 
 HEIC_SUFFIXES = (".heic", ".heif")
+AS_STORED = Assumption("the photo's EXIF orientation is ignored: the depth map is assumed to fit it as stored")
 _MODEL, _ORIENTATION, _EXIF_IFD, _EXIF_FOCAL_35 = 0x0110, 0x0112, 0x8769, 0xA405
 _ASPECT_TOLERANCE = 0.02
 # What turns a photo upright, by EXIF orientation: whether its axes are exchanged, then the steps of rows and columns.
@@ -58,8 +59,7 @@ def read_photo(path: Path, size_lr: Size) -> tuple[np.ndarray, list[Assumption]]
     if orientation >= 5 and not same_aspect(size, size_lr) and same_aspect(size[::-1], size_lr):
         found.append(Assumption("the photo is turned by its EXIF data, as the depth map is"))
         return _turn(pixels, orientation), found
-    found.append(Assumption("the photo's EXIF orientation is ignored: the depth map is assumed to fit it as stored"))
-    return pixels, found
+    return pixels, [*found, AS_STORED]
 
 
 def read_heic(path: Path) -> np.ndarray:
@@ -168,10 +168,7 @@ def read_exif(photo: Path) -> Exif:
 
 
 def write_png(path: Path, picture: np.ndarray, known: np.ndarray | None = None) -> None:
-    """Write a picture, grey (H, W) or blue-green-red (H, W, 3), uint8 or uint16, atomically.
-
-    ``known``, (H, W) bool: an 8-bit picture is transparent elsewhere.
-    """
+    """Write a picture, grey (H, W) or blue-green-red (H, W, 3), uint8 or uint16, transparent if not ``known``."""
     if known is not None and not known.all():
         picture = np.dstack((picture, np.where(known, 255, 0).astype(np.uint8)))
     with replacing(path) as temporary:

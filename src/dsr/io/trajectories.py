@@ -67,10 +67,8 @@ class Trajectory:
                         f"{min(self.times):.3f} to {max(self.times):.3f}"
                     )
         if len(self.poses) != len(pairs):
-            raise ValueError(
-                f"{self.file}: expected a pose for each of the {len(pairs)} frames, or their times, got "
-                f"{len(self.poses)} poses"
-            )
+            got = f"{len(self.poses)} poses for {len(pairs)} frames"
+            raise ValueError(f"{self.file}: expected a pose for each frame, or their times, got {got}")
         return {pair.name: pose for pair, pose in zip(pairs, self.poses, strict=True) if pose is not None}
 
     def at(self, wanted: np.ndarray, gap: float = _MAX_GAP) -> list[Matrix | None]:
@@ -122,11 +120,8 @@ def read_poses(path: Path) -> Trajectory:
     if lengths == {4} and len(rows) % 4 == 0:
         rows = np.reshape(rows, (-1, 16)).tolist()
     elif not timed and lengths not in ({12}, {16}):
-        raise ValueError(
-            f"{path}: expected lines of 8 numbers (time, translation, quaternion) or 9 (and an id), of 12 or 16 (a "
-            f"matrix), or four lines of 4 for each matrix, got lines of {', '.join(map(str, sorted(lengths))) or 'no'} "
-            "numbers"
-        )
+        text = "lines of 8 numbers (time, translation, quaternion), 9 (and an id), 12, 16 or four times 4 (matrices)"
+        raise ValueError(f"{path}: expected {text}, got lines of {', '.join(map(str, sorted(lengths))) or 'none'}")
     poses: list[Matrix | None] = []
     for number, row in enumerate(rows, 1):
         numbers, place = row[1:8] if timed else row[:12], f"{path}: pose {number}"
@@ -156,7 +151,6 @@ def order_of(numbers: Sequence[float]) -> list[int]:
 
 
 def _numbers(path: Path, text: str) -> list[list[float]]:
-    """Return the numbers in each line that has any."""
     rows = []
     for number, line in enumerate(text.splitlines(), 1):
         words = split_numbers(line.partition("#")[0])
@@ -169,7 +163,6 @@ def _numbers(path: Path, text: str) -> list[list[float]]:
 
 
 def _matrix_of_json(path: Path, text: str) -> list[list[float]]:
-    """Return the nested lists that JSON holds."""
     with refusing(f"{path}: expected JSON or rows of numbers, got something else", ValueError):
         content = parse_json(text)
     if isinstance(content, dict):
@@ -183,10 +176,7 @@ def _matrix_of_json(path: Path, text: str) -> list[list[float]]:
 
 
 def check_pose(source: str, matrix: np.ndarray, *, opengl: bool = False) -> np.ndarray:
-    """Return a rigid transform (4, 4) from camera to world as it is; ``source`` is the file and the place in it.
-
-    ``opengl``: the camera's axes are x right, y up, z backward, as ARKit and OpenGL have them.
-    """
+    """Return a rigid transform (4, 4) from camera to world; ``opengl``: the camera's axes are x right, y up."""
     if matrix.shape != (4, 4):
         raise ValueError(f"{source}: expected a matrix of 4 x 4 numbers, got {' x '.join(map(str, matrix.shape))}")
     as_rigid(matrix, source)
@@ -209,10 +199,8 @@ def fitting_camera(source: str, sizes: Sequence[tuple[int, int]], numbers: Seque
         if may_be_of(cx, cy, width, height):
             return intrinsics_camera(source, (height, width), numbers)
     intrinsics_camera(source, sizes[0], numbers)  # says what is wrong with numbers that are not finite
-    raise ValueError(
-        f"{source}: expected a principal point near the middle of the {sizes[0][1]} x {sizes[0][0]} photo (width x "
-        f"height), got {cx:g}, {cy:g}"
-    )
+    text = f"near the middle of the {sizes[0][1]} x {sizes[0][0]} photo (width x height)"
+    raise ValueError(f"{source}: expected a principal point {text}, got {cx:g}, {cy:g}")
 
 
 def describe_capture(app: str, unit: str, pairs: Sequence[Pair], *, poses: bool) -> Assumption:
@@ -223,10 +211,10 @@ def describe_capture(app: str, unit: str, pairs: Sequence[Pair], *, poses: bool)
 
 
 def add_trajectory(folder: Path, found: PairingResult) -> PairingResult:
-    """Return the pairs of a folder with the poses of the trajectory of Open3D's reconstruction system, if it fits.
+    """Return the pairs of a folder with the poses of Open3D's trajectory, if it fits.
 
-    That is a line of three whole numbers and the four rows of the pose for each frame
-    (http://redwood-data.org/indoor/fileformat.html): the n-th pose, by the first of the three, is of the n-th photo.
+    It has a line of three whole numbers, the first of which orders the poses, and the four rows of each pose
+    (http://redwood-data.org/indoor/fileformat.html).
     """
     path = next((folder / name for name in _OPEN3D_FILES if (folder / name).is_file()), None)
     if path is None or not found.pairs:

@@ -111,7 +111,6 @@ def _multiples(values: np.ndarray, step: int, share: float = _MOST) -> bool:
 
 
 def _interpret_whole(seen: _Map) -> Meaning:
-    """Return what whole numbers mean."""
     lowest = float(seen.values[~seen.holes].min())
     if lowest < seen.highest < _LEVELS and not seen.votes.verdict:
         raise ValueError(
@@ -171,7 +170,6 @@ def _by_steps(seen: _Map) -> Meaning | None:
 
 
 def _whole(seen: _Map, label: str, unit: float, why: str) -> Assumption:
-    """Return the note on a unit of whole numbers."""
     return Assumption(f"whole numbers are read as {label}: {why}; {_OVERRIDE}", f"median {seen.metres(unit)}")
 
 
@@ -201,13 +199,10 @@ def _by_median(seen: _Map) -> Meaning:
         if _MIN_MEDIAN <= middle * unit <= _MAX_MEDIAN:
             why = f"as millimetres the median would be {seen.metres(1e-3)}, now {seen.metres(unit)}"
             return Meaning(unit, (Assumption(f"whole numbers are read as {label}", why),))
-    raise ValueError(
-        f"{seen.name}: no usual unit makes its median of {middle:g} a distance; give one with --depth-unit"
-    )
+    raise ValueError(f"{seen.name}: no usual unit makes its median of {middle:g} a distance; give one (--depth-unit)")
 
 
 def _interpret_floats(seen: _Map) -> Meaning:
-    """Return what floats mean."""
     middle = seen.middle
     if seen.conclusive:
         _expect_metric(seen)

@@ -12,7 +12,7 @@ import os
 import re
 import stat
 import zipfile
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from difflib import get_close_matches
 from io import BufferedReader
 from numbers import Real
@@ -50,6 +50,13 @@ def expect_pixels(place: str | Path, height: int, width: int, most: int = MOST_P
     """Raise TooLargeError if a picture or map declares more than ``most`` pixels."""
     if height * width > most:
         raise TooLargeError(f"{place}: expected at most {most} pixels, got {width} x {height} (width x height)")
+
+
+def expect_size(expected: str, pixels: Any, size: tuple[int, int]) -> None:
+    """Raise a ValueError if pixels, (H, W) or (H, W, C), are not of a size; the message begins with ``expected``."""
+    got = pixels.shape
+    if got[:2] != size:
+        raise ValueError(f"{expected} {size[1]} x {size[0]} pixels (width x height), got {got[1]} x {got[0]}")
 
 
 def expect_bytes(place: str | Path, size: int, most: int) -> None:
@@ -206,6 +213,14 @@ def numbers_in(words: Iterable[str]) -> list[float]:
         return [float(word) for word in words]
     except ValueError:
         return []
+
+
+def named_numbers(place: str, entries: Mapping[str, str], names: Iterable[str]) -> list[float]:
+    """Return the numbers of some names in a table; a message begins with ``place``."""
+    came = {name: entries.get(name, "nothing") for name in names}
+    if not (values := numbers_in(came.values())):
+        raise ValueError(f"{place}: expected numbers for {', '.join(came)}, got {', '.join(came.values()):.120}")
+    return values
 
 
 def split_numbers(text: str) -> list[str]:

@@ -29,10 +29,12 @@ from dsr.io.exports import (
     write_mesh,
     write_normals,
     write_renderings,
+    write_rgbd_picture,
+    write_stereo,
 )
 from dsr.io.inputs import Picture
 from dsr.io.photos import write_png
-from dsr.io.scene_files import RGBD, write_rgbd
+from dsr.io.scene_files import write_rgbd
 from dsr.methods.base import Surface
 from dsr.notes import CHECKS, Assumption
 from dsr.utils.files import expect_targets, replacing, write_text
@@ -286,9 +288,13 @@ def _write_maps(folder: Path, result: Result) -> dict[str, Output]:
         write_png(folder / "filled.png", 255 * surface.filled[0].byte().cpu().numpy())
     if "input" in names:
         write_input(folder / INPUT, picture.rgb, picture.depth_lr)
-    if "rgbd" in names:
-        notes = write_rgbd(folder / "rgbd", picture.rgb, surface.depth, camera)
-        written["rgbd"] = Output([f"rgbd/{name}" for name in RGBD], notes)
+    for name, place, write in (
+        ("rgbd", "rgbd", write_rgbd),
+        ("stereo", "stereo_2x1.jpg", write_stereo),
+        ("rgbd_picture", "rgbd_2x1.png", write_rgbd_picture),
+    ):
+        if name in names:
+            written[name] = Output(PARTS[name].files, write(folder / place, picture.rgb, surface.depth, camera))
     return written
 
 

@@ -48,6 +48,8 @@ PARTS: dict[str, Part] = {
         Part("mesh_ply", ("mesh.ply",), usual=False, large=True, shape=True, errors=True),
         Part("cloud", ("cloud.ply",), usual=False, large=True, shape=True, errors=True),
         Part("rgbd", ("rgbd/color.png", "rgbd/depth.png", "rgbd/intrinsic.json"), usual=False),
+        Part("stereo", ("stereo_2x1.jpg",), usual=False),
+        Part("rgbd_picture", ("rgbd_2x1.png",), usual=False),
         Part("open3d", ("open3d",), of_all=True, usual=False),
         Part("nerfstudio", ("transforms.json", "nerfstudio", "normals_from_pretrain"), of_all=True, usual=False,
              poses=True),

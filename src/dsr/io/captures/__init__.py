@@ -6,14 +6,13 @@ Other packages add readers by an entry point of the group ``dsr.captures`` that 
 
 from __future__ import annotations
 
-import re
 from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dsr.io.captures.contract import Capture, has_any
+from dsr.io.captures.contract import Capture, has_any, in_head
 from dsr.utils.guards import refusing
 
 if TYPE_CHECKING:
@@ -205,7 +204,7 @@ CAPTURES = (
         "https://github.com/microsoft/Azure-Kinect-Sensor-SDK/tree/develop/src/record",
         of_file=partial(_call, "kinect.read"),
         suffixes=(".mkv",),
-        mark=re.compile(rb"K4A_DEPTH_MODE"),
+        mark=partial(in_head, b"K4A_DEPTH_MODE"),
     ),
     Capture(
         "HEIC photos with depth",
@@ -217,7 +216,21 @@ CAPTURES = (
         "https://developer.apple.com/documentation/avfoundation/avdepthdata",
         of_file=partial(_call, "heic.read"),
         suffixes=(".heic", ".heif"),
-        mark=re.compile(rb"urn:mpeg:hevc:2015:auxid:2|urn:mpeg:mpegB:cicp:systems:auxiliary:depth"),
+        mark=partial(in_head, b"urn:mpeg:hevc:2015:auxid:2|urn:mpeg:mpegB:cicp:systems:auxiliary:depth"),
+    ),
+    Capture(
+        "JPEG photos with depth",
+        "the unmodified `.jpg` of an Android phone's portrait or depth mode, or of Google Camera's Lens Blur",
+        "`*.jpg`, `*.jpeg` with GDepth or Dynamic Depth 1.0 in their XMP, of a folder if no depth maps are beside them",
+        "depth in m, mm or dioptres, or relative (8 or 16 bits); the photo before effects; confidence; intrinsics of "
+        "Dynamic Depth, else EXIF",
+        "written by their specifications",
+        "256 steps; of two lenses or a network: guesses on blank walls, hair and glass, mostly no true distances",
+        "https://developers.google.com/depthmap-metadata",
+        of_file=partial(_call, "jpeg.read"),
+        suffixes=(".jpg", ".jpeg"),
+        mark=partial(_call, "jpeg.has_depth"),
+        last=True,
     ),
     Capture(
         "COLMAP",
@@ -283,9 +296,10 @@ def all_captures() -> tuple[Capture, ...]:
     return (*others, *CAPTURES)
 
 
-def find_capture(place: Path) -> PairingResult | None:
-    """Return the frames of a capture, a folder or a file; None if it is none."""
-    return next((found for each in all_captures() if (found := each.frames(place)) is not None), None)
+def find_capture(place: Path, *, last: bool = False) -> PairingResult | None:
+    """Return the frames of a capture, a file or a folder, of those that are asked first or last; None if it is none."""
+    asked = (each for each in all_captures() if each.last == last or place.is_file())
+    return next((found for each in asked if (found := each.frames(place)) is not None), None)
 
 
 def lacking(folder: Path) -> list[str]:

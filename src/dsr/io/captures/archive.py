@@ -4,6 +4,7 @@ import atexit
 import contextlib
 import functools
 import lzma
+import math
 import struct
 import tempfile
 import zipfile
@@ -64,6 +65,14 @@ def inflate(content: bytes, size: int, bits: int = zlib.MAX_WBITS) -> bytes:
     return values
 
 
+def as_pixels(content: bytes, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Return values of a type that are stored one after another as an array of a shape."""
+    if len(content) != math.prod(shape) * np.dtype(dtype).itemsize:
+        sides = " x ".join(map(str, shape))
+        raise ValueError(f"expected {sides} values (height x width) of {np.dtype(dtype)}, got {len(content)} bytes")
+    return np.frombuffer(content, dtype).reshape(shape)
+
+
 def decode_photo(content: bytes) -> np.ndarray:
     """Return the pixels of an encoded photo, (H, W, 3) uint8 RGB."""
     pixels = decode_pixels("photo", content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -74,18 +83,13 @@ def decode_photo(content: bytes) -> np.ndarray:
 
 @functools.lru_cache(maxsize=1)
 def _open(path: Path, _state: tuple[int, int]) -> zipfile.ZipFile:
-    """Return the open archive."""
     with refusing(f"{path}: expected a ZIP archive, got a damaged, truncated or foreign file", *_DAMAGED):
         return zipfile.ZipFile(path)
 
 
 @functools.cache
 def unpack(path: Path, state: tuple[int, int]) -> Path:
-    """Return a temporary folder with the files of a ZIP file in a :func:`file_state`, deleted when the program ends.
-
-    A ValueError if it is damaged or encrypted, a member is a link or leads outside the folder, or they are larger than
-    the size of the archive explains.
-    """
+    """Return a folder with the files of a ZIP file in a :func:`file_state`, which the end of the program deletes."""
     packed = _open(path, state)
     inside = [each for each in files_in(packed, path) if not each.filename.startswith("__MACOSX/")]
     total = sum(each.file_size for each in inside)

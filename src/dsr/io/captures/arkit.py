@@ -89,7 +89,6 @@ def find_intrinsics(folder: Path, stem: str) -> Path | None:
 
 
 def _arkitscenes_geometry(place: str, intrinsics: Path | None, motion: _Motion | None) -> Geometry:
-    """Return camera and pose of a frame."""
     camera = None
     if intrinsics is not None:
         width, height, *numbers = read_numbers(intrinsics, 6).tolist()
@@ -155,7 +154,6 @@ def find_polycam(folder: Path) -> PairingResult | None:
 
 
 def _polycam_geometry(path: Path) -> Geometry:
-    """Return camera and pose of a frame."""
     stored = parse_model(_PolycamCamera, read_text(path, _LARGEST_JSON), path, f"expected {_POLYCAM}'s camera; ")
     camera = intrinsics_camera(str(path), (stored.height, stored.width), (stored.fx, stored.fy, stored.cx, stored.cy))
     rows = [[getattr(stored, name) for name in names] for names in _POSE]
@@ -198,7 +196,6 @@ def find_scanner_app(folder: Path) -> PairingResult | None:
 
 
 def _scanner_geometry(path: Path | None, size: Size) -> Geometry:
-    """Return camera and pose of a frame."""
     if path is None:
         return Geometry(assumptions=(Assumption("no camera and no pose: there is no JSON of the frame"),))
     stored = parse_model(_ScannerFrame, read_text(path, _LARGEST_JSON), path, f"expected {_SCANNER}'s frame; ")

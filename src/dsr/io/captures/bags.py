@@ -150,9 +150,7 @@ def decode_message(message: Any) -> np.ndarray:
     dtype = np.dtype(DEPTHS.get(message.encoding, "u1")).newbyteorder(">" if message.is_bigendian else "<")
     height, width, step = message.height, message.width, message.step
     if min(height, width) < 1 or step < width * channels * dtype.itemsize or data.size != height * step:
-        raise ValueError(
-            f"expected an image of {width} x {height} pixels in rows of {step} bytes, got {data.size} bytes"
-        )
+        raise ValueError(f"expected an image of {width} x {height} in rows of {step} bytes, got {data.size} bytes")
     rows = data.reshape(height, step)[:, : width * channels * dtype.itemsize]
     values = np.ascontiguousarray(rows).view(dtype).reshape(height, width, *([channels] if channels > 1 else []))
     if message.encoding in DEPTHS:

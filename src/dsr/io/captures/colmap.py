@@ -108,12 +108,10 @@ def model_file(place: Path) -> Path | None:
 
 
 def _beside(file: Path, name: str) -> Path:
-    """Return the file of a name beside that of the images."""
     return file.with_name(name + file.suffix)
 
 
 def _damaged(path: Path) -> AbstractContextManager[None]:
-    """Name a file that ends early."""
     return refusing(f"{path}: expected a model of {_APP}, got a damaged or truncated file", struct.error)
 
 
@@ -131,7 +129,6 @@ def _read_model(file: Path) -> tuple[dict[int, _Camera], list[_Image]]:
 
 
 def _frame(file: Path, image: _Image, camera: _Camera) -> CaptureFrame:
-    """Return the frame of an image, with camera and pose from the model."""
     placed = (image.quaternion, image.translation, camera)
     geometry = stated(_geometry, f"{file}: image {image.name!r:.80}", *placed)
     return CaptureFrame(_APP, geometry, file, repr(placed).encode())
@@ -170,7 +167,6 @@ def _joined(model: CaptureFrame, capture: CaptureFrame, size: Size) -> Geometry:
 
 
 def _note(count: int, total: int, file: Path) -> Assumption:
-    """Return what was taken from a model."""
     text = f"cameras and poses of {_APP}: {file.parent.name}/{file.name}; its unit is assumed to be the metre"
     return Assumption(text, f"{count} of {total} photos")
 
@@ -232,7 +228,6 @@ class _SparseDepth(Source):
 
 
 def _geometry(place: str, quaternion: Sequence[float], translation: Sequence[float], camera: _Camera) -> Geometry:
-    """Return camera, pose and lens of an image."""
     model, numbers = camera.model, camera.numbers
     fx, fy, (cx, cy) = numbers[0], numbers[model.focal - 1], numbers[model.focal : model.focal + 2]
     found = intrinsics_camera(place, (camera.height, camera.width), (fx, fy, cx - 0.5, cy - 0.5))
@@ -269,20 +264,16 @@ class _Bytes:
 def _checked(
     path: Path, model: _Model | None, came: object, width: float, height: float, numbers: Sequence[float]
 ) -> _Camera:
-    """Return a camera after checking that it is one."""
     if model is None:
         raise ValueError(f"{path}: expected a camera model of {', '.join(_BY_NAME)}, got {came!s:.40}")
-    if len(numbers) != model.focal + 2 + model.bends:
-        raise ValueError(
-            f"{path}: expected {model.focal + 2 + model.bends} numbers of {model.name}, got {len(numbers)}"
-        )
+    if len(numbers) != (count := model.focal + 2 + model.bends):
+        raise ValueError(f"{path}: expected {count} numbers of {model.name}, got {len(numbers)}")
     if not all(1 <= side <= _LARGEST_SIDE and float(side).is_integer() for side in (width, height)):
         raise ValueError(f"{path}: expected a width and a height in pixels, got {width:g} x {height:g}")
     return _Camera(model, int(width), int(height), tuple(numbers))
 
 
 def _cameras_of_bytes(path: Path, content: bytes) -> dict[int, _Camera]:
-    """Return the cameras of ``cameras.bin`` by their numbers."""
     file, cameras = _Bytes(content), {}
     for _ in range(*file.read("Q")):
         number, kind, width, height = file.read("iiQQ")
@@ -293,7 +284,6 @@ def _cameras_of_bytes(path: Path, content: bytes) -> dict[int, _Camera]:
 
 
 def _images_of_bytes(_path: Path, content: bytes) -> list[_Image]:
-    """Return the images of ``images.bin``."""
     file, images = _Bytes(content), []
     for _ in range(*file.read("Q")):
         _, *numbers, camera = file.read("I7dI")
@@ -316,7 +306,6 @@ def _lines(content: bytes) -> Iterator[str]:
 
 
 def _cameras_of_text(path: Path, content: bytes) -> dict[int, _Camera]:
-    """Return the cameras of ``cameras.txt`` by their numbers."""
     cameras = {}
     for line in filter(str.strip, _lines(content)):
         words = line.split()
@@ -329,7 +318,6 @@ def _cameras_of_text(path: Path, content: bytes) -> dict[int, _Camera]:
 
 
 def _images_of_text(path: Path, content: bytes) -> list[_Image]:
-    """Return the images of ``images.txt``."""
     images, lines = [], iter(_lines(content))
     for line in lines:
         if not line.strip():

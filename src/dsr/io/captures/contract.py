@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dsr.utils.guards import natural_key
+from dsr.utils.guards import natural_key, opened
 
 if TYPE_CHECKING:
     from dsr.io.pairs import PairingResult
@@ -32,7 +32,8 @@ class Capture:
         of_folder: returns the frames of a folder; None if it is another one.
         of_file: returns the frames of a file with one of the ``suffixes``.
         suffixes: of captures that are a single file, in lower case; a folder may have several of them.
-        mark: in the first megabyte of such a file, and of no other of its suffix; None if the suffix says it.
+        mark: tells such a file from others of its suffix; any file by default.
+        last: whether a folder is asked only if its files make no pairs, as of photos with depth maps beside them.
         marks: patterns of paths below its folder, any of which distinguishes it from others; ``*`` in the last part
             stands for anything. Empty for single files, and for layouts without characteristic names.
         needs: patterns of its parts, alternatives as ``A or B``; those that match nothing are named to the user of a
@@ -50,7 +51,8 @@ class Capture:
     of_folder: Callable[[Path], PairingResult | None] = lambda _: None
     of_file: Callable[[Path], PairingResult] | None = None
     suffixes: tuple[str, ...] = ()
-    mark: re.Pattern[bytes] | None = None
+    mark: Callable[[Path], bool] = lambda _: True
+    last: bool = False
     marks: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()
 
@@ -60,7 +62,9 @@ class Capture:
         if place.is_file():
             if of_file is None or place.suffix.lower() not in self.suffixes:
                 return None
-            if not self._has_mark(place):
+            if not self.mark(place):
+                if self.last:
+                    return None
                 raise ValueError(f"{place}: expected {self.name}, got another {place.suffix} file")
             return of_file(place)
         found = self.of_folder(place)
@@ -71,13 +75,8 @@ class Capture:
             return None
         from dsr.io.pairs import join  # noqa: PLC0415 - torch takes seconds to import, and the table needs none
 
-        files = sorted(filter(self._has_mark, files), key=natural_key)
+        files = sorted(filter(self.mark, files), key=natural_key)
         return join({path.stem: of_file(path) for path in files}) if files else None
-
-    def _has_mark(self, path: Path) -> bool:
-        from dsr.io.captures.archive import read_section  # noqa: PLC0415 - as above
-
-        return self.mark is None or self.mark.search(read_section(path, 0, _HEAD)) is not None
 
     def rows(self) -> dict[str, str]:
         """Return the description, text by label, the name first; empty texts are left out."""
@@ -87,6 +86,12 @@ class Capture:
 
     def __str__(self) -> str:
         return "\n".join(f"  {label:9}{text}" if label else text for label, text in self.rows().items())
+
+
+def in_head(pattern: bytes, path: Path) -> bool:
+    """Return whether a pattern is in the first megabyte of a file."""
+    with opened(path) as file:
+        return re.search(pattern, file.read(_HEAD)) is not None
 
 
 def has_name(folder: Path, first: str, last: str) -> bool:

@@ -44,7 +44,7 @@ from dsr.io.reading import SUNRGBD_BITS
 from dsr.io.trajectories import NO_POSE, describe_capture, intrinsics_camera, read_poses
 from dsr.io.units import TURNED_BACK
 from dsr.notes import Assumption
-from dsr.utils.guards import MOST_TEXT, natural_key, numbers_in, read_limited, read_text, refusing
+from dsr.utils.guards import MOST_TEXT, named_numbers, natural_key, read_limited, read_text, refusing
 
 _KINECT = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
 _NICE_SLAM, _REPLICA_UNIT = Camera(1200, 680, 600.0, 600.0, 599.5, 339.5), 1 / 6553.5
@@ -158,7 +158,6 @@ def find_zed(folder: Path) -> PairingResult | None:
 
 
 def _zed(path: Path, text: str, size: Size) -> Geometry:
-    """Return the camera of the rectified photo of (height, width)."""
     if size not in _ZED_SIZES:
         sizes = ", ".join(f"{width} x {height}" for height, width in _ZED_SIZES)
         return Geometry(None, None, (Assumption(f"{path.name} is not used: it is of photos of {sizes}"),))
@@ -169,16 +168,13 @@ def _zed(path: Path, text: str, size: Size) -> Geometry:
     if parser.has_section("STEREO"):
         for name in ("TY", "TZ"):
             parser["STEREO"].setdefault(f"{name}_{resolution}", parser.get("STEREO", name, fallback="0"))
-
-    def numbers(section: str, *names: str) -> np.ndarray:
-        came = [parser.get(section, name, fallback="nothing") for name in names]
-        values = np.array(numbers_in(came))
-        if not len(values) or not np.isfinite(values).all():
-            raise ValueError(f"{path}: {section}: expected numbers for {', '.join(names)}, got {', '.join(came):.120}")
-        return values
-
-    left, right = (numbers(f"{side}_CAM_{resolution}", *_ZED_CAMERA) for side in ("LEFT", "RIGHT"))
-    between = numbers("STEREO", "Baseline", *(f"{name}_{resolution}" for name in ("TY", "TZ", "RX", "CV", "RZ")))
+    stereo = "Baseline", *(f"{name}_{resolution}" for name in ("TY", "TZ", "RX", "CV", "RZ"))
+    names = {f"LEFT_CAM_{resolution}": _ZED_CAMERA, f"RIGHT_CAM_{resolution}": _ZED_CAMERA, "STEREO": stereo}
+    stored = dict(parser)
+    numbers = [named_numbers(f"{path}: {each}", stored.get(each, {}), keys) for each, keys in names.items()]
+    left, right, between = (np.array(each) for each in numbers)
+    if not np.isfinite((*left, *right, *between)).all():
+        raise ValueError(f"{path}: expected finite numbers, got others")
     matrices = [np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) for fx, fy, cx, cy, *_ in (left, right)]
     with refusing(f"{path}: expected the calibration of two cameras side by side, got another", cv2.error):
         rectified = cv2.stereoRectify(

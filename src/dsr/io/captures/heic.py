@@ -8,16 +8,16 @@ pixels of the reference size, of the picture before it is turned as its properti
 up to an unknown scale and shift.
 """
 
-import functools
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from dsr.io.frames import CaptureFrame, Geometry, Size, Source
+from dsr.io.cameras import turn_camera
+from dsr.io.frames import CaptureFrame, Geometry, Source, accuracy_notes, stated
 from dsr.io.pairs import Pair, PairingResult
-from dsr.io.photos import decode_heic, open_heic, read_heic, same_aspect, turned_in_heic
+from dsr.io.photos import decode_heic, open_heic, read_heic, turned_in_heic
 from dsr.io.trajectories import intrinsics_camera
 from dsr.notes import Assumption
 from dsr.utils.guards import MOST_FILE, MOST_TEXT, numbers_in, read_limited
@@ -59,40 +59,23 @@ def read(path: Path) -> PairingResult:
     first, end = content.rfind(b"<x:xmpmeta", 0, max(place, 0)), content.find(b"</x:xmpmeta>", max(place, 0))
     xmp = content[first:end] if place >= 0 and first >= 0 and end - first <= MOST_TEXT and end >= 0 else b""
     sources = _HeicImage(path, "photo"), _HeicImage(path, "depth")
-    frame = CaptureFrame(_APP, functools.partial(_geometry, path, xmp), path, xmp, *sources)
+    frame = CaptureFrame(_APP, stated(_geometry, path, xmp), path, xmp, *sources)
     pair = Pair(path.stem, path, path / "depth", unit=1.0, capture=frame)
     return PairingResult((pair,), (Assumption("HEIC photos with depth maps of their own"),))
 
 
-def _geometry(path: Path, xmp: bytes, size: Size) -> Geometry:
-    """Return the camera of a photo of (height, width)."""
+def _geometry(path: Path, xmp: bytes) -> Geometry:
     text = xmp.decode(errors="replace")
     accuracy = re.search(r"depthData:Accuracy\W{1,3}(\w+)", text)
-    notes = []
-    if accuracy is None or accuracy[1] != "absolute":
-        known = "is relative, as the file states" if accuracy else "may be relative, the file does not say"
-        notes.append(Assumption(f"the depth {known}: sizes and distances mean little"))
+    absolute = accuracy is not None and accuracy[1] == "absolute"
+    notes = tuple(accuracy_notes(absolute=absolute, stated=accuracy is not None))
     matrix = re.search(r"depthData:IntrinsicMatrix>(.*?)</depthData:IntrinsicMatrix>", text, re.DOTALL)
     sides = dict(re.findall(r"depthData:IntrinsicMatrixReference(Width|Height)\W{1,3}(\d{1,6})\b", text))
     if matrix is None or len(sides) < 2:
-        return Geometry(None, None, tuple(notes))
+        return Geometry(None, None, notes)
     values = numbers_in(re.findall(r"<rdf:li>\s*([^<\s]*)\s*</rdf:li>", matrix[1]))
     width, height = int(sides["Width"]), int(sides["Height"])
     if len(values) != 9 or min(width, height) < 1:
         raise ValueError(f"{path}: depthData:IntrinsicMatrix: expected 9 numbers, got {matrix[1].strip()!r:.60}")
-    fx, _, _, _, fy, _, cx, cy, _ = values
-    orientation = turned_in_heic(path)
-    if orientation in (3, 8):  # turned by a half, or to the left; mirrored pictures are no photos of a camera
-        cx = width - 1 - cx
-    if orientation in (3, 6):
-        cy = height - 1 - cy
-    turned = (height, width)
-    if orientation in (6, 8):
-        fx, fy, cx, cy, turned = fy, fx, cy, cx, (width, height)
-    if not same_aspect(turned, size):
-        raise ValueError(
-            f"{path}: depthData:IntrinsicMatrix: expected the photo's aspect, got a camera of {turned[1]} x "
-            f"{turned[0]} for {size[1]} x {size[0]} pixels (width x height)"
-        )
-    camera = intrinsics_camera(f"{path}: depthData:IntrinsicMatrix", turned, (fx, fy, cx, cy))
-    return Geometry(camera, None, tuple(notes))
+    camera = intrinsics_camera(f"{path}: depthData:IntrinsicMatrix", (height, width), [values[n] for n in (0, 4, 6, 7)])
+    return Geometry(turn_camera(camera, turned_in_heic(path)), None, notes)

@@ -22,11 +22,11 @@ from pydantic import AliasPath, BaseModel, Field
 
 from dsr.geometry.camera import Camera, Lens
 from dsr.geometry.poses import as_rigid, invert
-from dsr.io.captures.archive import decode_photo
+from dsr.io.captures.archive import as_pixels, decode_photo
 from dsr.io.frames import CaptureFrame, Geometry, Part, Record, Rig, Size, file_state, stated
 from dsr.io.pairs import PairingResult, Shot, pair_by_time
 from dsr.io.trajectories import describe_capture, intrinsics_camera
-from dsr.utils.guards import expect_pixels, numbers_in, opened, refusing
+from dsr.utils.guards import expect_pixels, expect_size, numbers_in, opened, refusing
 from dsr.utils.validation import Number, Whole, parse_model
 from dsr.utils.versions import how_to_install
 
@@ -81,7 +81,6 @@ class _Packet(Part):
 
 
 def _fetch(path: Path, number: int, time: int) -> bytes:
-    """Return the frame of a track as it is stored."""
     with _recording(path) as container:
         track = container.streams[number]
         container.seek(time, stream=track, any_frame=True)
@@ -96,20 +95,13 @@ def _decode(size: Size, kind: str, content: bytes) -> np.ndarray:
     height, width = size
     if kind == "MJPG":
         photo = decode_photo(content)
-        if photo.shape[:2] != size:
-            got = f"{photo.shape[1]} x {photo.shape[0]}"
-            raise ValueError(f"expected a photo of {width} x {height} pixels, got {got}")
+        expect_size("expected a photo of", photo, size)
         return photo
     each, code = _COLOURS.get(kind, (2, 0))
-    if len(content) != height * width * each:
-        raise ValueError(
-            f"expected {width} x {height} pixels of {each:g} bytes, which are {height * width * each:g}, "
-            f"got {len(content)} bytes"
-        )
     if kind == _DEPTH:
-        return np.frombuffer(content, ">u2").reshape(size).astype(np.uint16)
+        return as_pixels(content, ">u2", size).astype(np.uint16)
     rows = (height * 3 // 2, width, 1) if kind == "NV12" else (height, width, int(each))
-    return cv2.cvtColor(np.frombuffer(content, np.uint8).reshape(rows), code)
+    return cv2.cvtColor(as_pixels(content, "u1", rows), code)
 
 
 def read(path: Path) -> PairingResult:
@@ -147,7 +139,6 @@ def read(path: Path) -> PairingResult:
 
 
 def _track(path: Path, container: Any, role: str) -> Any:
-    """Return a track by its tag or its name."""
     name = role.upper()
     for track in container.streams.video:
         known = f"K4A_{name}_TRACK" in track.metadata or track.metadata.get("title") == name
@@ -193,7 +184,6 @@ def _part_of(place: str, numbers: Sequence[float], whole: Size, cut: tuple[float
 
 
 def _lens(place: str, camera: _Camera) -> Lens:
-    """Return the lens of a camera."""
     kind = camera.kind
     k1, k2, k3, k4, k5, k6, codx, cody, p2, p1 = camera.numbers[4:14]
     if kind != _LENS and (kind != _LENS_6KT or codx or cody):  # with a centre of its own: of devices that were not sold

@@ -94,7 +94,6 @@ def _choose(reader: Any, path: Path, topics: dict[str, re.Match[str]], kind: str
 
 
 def _stream(reader: Any, path: Path, stream: str) -> _Stream:
-    """Return the camera of a stream."""
     place = f"{path}{stream}"
     info = first_message(reader, f"{stream}/info/camera_info")
     if info is not None:
@@ -106,9 +105,7 @@ def _stream(reader: Any, path: Path, stream: str) -> _Stream:
         sizes = numbers_in(entries.get(key, "") for key in ("height", "width"))
         model, distortion = entries.get("model", "None"), numbers_in(entries.get("coeffs", "").split(","))
         if not numbers or not sizes:
-            raise ValueError(
-                f"{place}: expected width, height, fx, fy, ppx and ppy in camera_info, got {entries!s:.120}"
-            )
+            raise ValueError(f"{place}: expected width, height, fx, fy, ppx, ppy in camera_info, got {entries!s:.120}")
         size = int(sizes[0]), int(sizes[1])
     if min(size) < 1:
         raise ValueError(f"{place}: expected a positive width and height, got {size[1]} x {size[0]}")
@@ -127,7 +124,6 @@ def _stream(reader: Any, path: Path, stream: str) -> _Stream:
 
 
 def _transforms(reader: Any, stream: str) -> list[str]:
-    """Return the topics of a stream's transforms."""
     return sorted(each.topic for each in reader.connections if each.topic.startswith(f"{stream}/tf/"))
 
 
@@ -203,7 +199,6 @@ def _shots(reader: Any, path: Path, topic: re.Match[str]) -> list[Shot]:
 
 
 def _device(reader: Any) -> str:
-    """Return the name of the device, as it is recorded."""
     for _, message in messages_of(reader, "/device_0/info"):
         name = message.value if getattr(message, "key", "") == "Name" else ""
         if hasattr(message, "data"):

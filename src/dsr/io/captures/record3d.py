@@ -13,7 +13,6 @@ to the world; the camera has OpenGL's axes. Recordings of the front camera have 
 """
 
 import functools
-import json
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -23,7 +22,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from dsr.geometry.poses import from_quaternion
-from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo, members, read_part
+from dsr.io.captures.archive import PHOTO_LIMIT, as_pixels, decode_photo, members, read_part
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Part, Size, stated
 from dsr.io.pairs import Pair, PairingResult, numbered_files, paired
 from dsr.io.trajectories import ARKIT_TO_DSR, describe_capture, intrinsics_camera
@@ -59,11 +58,7 @@ def find(folder: Path) -> PairingResult | None:
     if not path.is_file() or not any((folder / "depth").glob("*.exr")):
         return None
     content = read_part(folder, path.name, _METADATA_LIMIT)
-    try:
-        entries = json.loads(content)
-    except (ValueError, RecursionError):
-        return None
-    if not isinstance(entries, dict) or not {"K", "w", "h"} <= entries.keys():  # of another app
+    if not all(f'"{key}"'.encode() in content for key in ("K", "w", "h")):  # of another app
         return None
     files = {
         "jpg": numbered_files(folder / "rgb", (".jpg", ".jpeg", ".png")),
@@ -126,7 +121,6 @@ def _frames(
 
 
 def _geometry(place: str, metadata: _Metadata, own: list[float] | None, pose: list[float] | None) -> Geometry:
-    """Return camera and pose of a frame, whose intrinsics may be its own."""
     K = metadata.K
     camera = intrinsics_camera(place, (metadata.h, metadata.w), own or [K[0], K[4], K[6], K[7]])
     text = "camera: K of the first frame; the metadata have none of each frame"
@@ -142,10 +136,4 @@ def decode_lzfse(content: bytes, size: Size, dtype: str) -> np.ndarray:
         import lzfse  # noqa: PLC0415 - an extra
     with refusing(f"expected LZFSE data, got {len(content)} damaged bytes", lzfse.error, MemoryError):
         values = lzfse.decompress(content)
-    expected = size[0] * size[1] * np.dtype(dtype).itemsize
-    if len(values) != expected:
-        raise ValueError(
-            f"expected {size[1]} x {size[0]} values of {np.dtype(dtype)} ({expected} bytes), "
-            f"got LZFSE data of {len(values)}"
-        )
-    return np.frombuffer(values, dtype).reshape(size)
+    return as_pixels(values, dtype, size)

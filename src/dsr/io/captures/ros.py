@@ -139,7 +139,6 @@ def _choose(path: Path, topics: Sequence[_Topic]) -> tuple[_Topic, _Topic]:
 
 
 def _shots(reader: Any, path: Path, topic: str) -> list[Shot]:
-    """Return the images of a topic with the times in their headers."""
     shots = []
     for message in images_of(reader, path, topic):
         seconds, nanoseconds = struct.unpack_from("<II", message.raw, 4)  # after a sequence number, or CDR's header
@@ -251,7 +250,6 @@ def _apart(path: Path, photo: _Topic, depth: _Topic, motion: Matrix | None) -> G
 
 
 def _camera(path: Path, topic: _Topic) -> Geometry:
-    """Return the camera and the lens of a topic."""
     info, what = topic.info, "photo" if topic.role == "rgb" else "depth map"
     place = f"{path}{PurePosixPath(topic.name).parent / 'camera_info'}"
     if info is None:

@@ -30,7 +30,7 @@ from pydantic import BaseModel, Field, RootModel
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.poses import as_rigid
-from dsr.io.captures.archive import PHOTO_LIMIT, decode_photo, inflate, read_section
+from dsr.io.captures.archive import PHOTO_LIMIT, as_pixels, decode_photo, inflate, read_section
 from dsr.io.captures.stray import VideoFrame, frames_of_video
 from dsr.io.frames import CaptureFrame, Geometry, Part, Size, stated
 from dsr.io.images import read_numbers
@@ -107,42 +107,25 @@ def _read_header(path: Path, file: BufferedReader) -> _Sens:
     matrix, (colour, depth) = values[:16], values[64:66]
     wide, high, narrow, low, scale, count = values[66:]
     if colour not in (0, 1, 2) or depth not in (0, 1):
-        raise ValueError(
-            f"{path}: expected colour that is raw, PNG or JPEG (0, 1, 2) and depth that is raw or of zlib (0, 1), got "
-            f"compression {colour} and {depth}"
-        )
+        raise ValueError(f"{path}: expected colour as 0, 1, 2, depth as 0, 1, got compression {colour} and {depth}")
     if not all(1 <= side <= _LARGEST_SIDE for side in (wide, high, narrow, low)) or not 1 <= scale <= 1e6:
-        raise ValueError(
-            f"{path}: expected sizes and values per metre, got {wide} x {high}, {narrow} x {low} and {scale:g}"
-        )
+        got = f"{wide} x {high}, {narrow} x {low} and {scale:g}"
+        raise ValueError(f"{path}: expected sizes and values per metre, got {got}")
     numbers = [matrix[0], matrix[5], matrix[2], matrix[6]]
     return _Sens(numbers, (colour, depth), (high, wide), (low, narrow), scale, count)
 
 
 def _photo(header: _Sens, content: bytes) -> np.ndarray:
-    """Return the photo in the bytes of a frame."""
-    if header.compression[0]:
-        return decode_photo(content)
-    if len(content) != 3 * header.photo[0] * header.photo[1]:
-        raise ValueError(f"expected {header.photo[1]} x {header.photo[0]} colours, got {len(content)} bytes")
-    return np.frombuffer(content, np.uint8).reshape(*header.photo, 3)
+    return decode_photo(content) if header.compression[0] else as_pixels(content, "u1", (*header.photo, 3))
 
 
 def _depth(header: _Sens, content: bytes) -> np.ndarray:
-    """Return the depth map in the bytes of a frame, (h, w) uint16."""
-    size = 2 * header.depth[0] * header.depth[1]
-    values = inflate(content, size) if header.compression[1] else content
-    if len(values) != size:
-        raise ValueError(f"expected {header.depth[1]} x {header.depth[0]} values of 16 bits, got {len(values)} bytes")
-    return np.frombuffer(values, "<u2").reshape(header.depth)
+    content = inflate(content, 2 * header.depth[0] * header.depth[1]) if header.compression[1] else content
+    return as_pixels(content, "<u2", header.depth)
 
 
 def _sens_geometry(place: str, header: _Sens, values: tuple[float, ...]) -> Geometry:
-    """Return camera and pose of a frame."""
-    camera, matrix = intrinsics_camera(place, header.photo, header.intrinsics), np.reshape(values, (4, 4))
-    if not np.isfinite(matrix).all():
-        return Geometry(camera, None, (NO_POSE,))
-    return Geometry(camera, as_rigid(matrix, place))
+    return _placed(intrinsics_camera(place, header.photo, header.intrinsics), np.reshape(values, (4, 4)), place)
 
 
 def find_export(folder: Path) -> PairingResult | None:
@@ -178,9 +161,14 @@ def _export_geometry(matrices: list[Path], path: Path, size: Size) -> Geometry:
 def with_pose(camera: Camera | None, path: Path, notes: tuple[Assumption, ...] = ()) -> Geometry:
     """Return a camera with the pose of 4 x 4 numbers in a text file; none if it is missing, or tracking was lost."""
     matrix = read_numbers(path, 16).reshape(4, 4) if path.is_file() else np.full((4, 4), np.nan)
+    return _placed(camera, matrix, str(path), notes)
+
+
+def _placed(camera: Camera | None, matrix: np.ndarray, place: str, notes: tuple[Assumption, ...] = ()) -> Geometry:
+    """Return a camera with a pose, (4, 4), that is not finite where there is none."""
     if not np.isfinite(matrix).all():
         return Geometry(camera, None, (*notes, NO_POSE))
-    return Geometry(camera, as_rigid(matrix, str(path)), notes)
+    return Geometry(camera, as_rigid(matrix, place), notes)
 
 
 _Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -256,7 +244,6 @@ def _map(content: bytes) -> np.ndarray:
 
 
 def _iphone_geometry(place: str, entry: _Entry, size: Size) -> Geometry:
-    """Return camera and pose of a frame."""
     camera, notes = None, [] if entry.aligned_pose else [NO_POSE]
     if entry.intrinsic is not None:
         (fx, _, cx), (_, fy, cy), _ = entry.intrinsic

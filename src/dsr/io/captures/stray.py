@@ -29,7 +29,7 @@ from dsr.io.pairs import PHOTO_SUFFIXES, Pair, PairingResult, numbered_files, pa
 from dsr.io.trajectories import USUAL_SIZE, describe_capture, fitting_camera
 from dsr.notes import Assumption
 from dsr.utils.decoding import QUIET_DECODERS
-from dsr.utils.guards import expect_pixels, numbers_in, read_text, refusing
+from dsr.utils.guards import expect_pixels, named_numbers, numbers_in, read_text, refusing
 from dsr.utils.versions import hash_once
 
 _APP = "Stray Scanner"
@@ -71,10 +71,7 @@ def find(folder: Path) -> PairingResult | None:
 def frames_of_video(
     video: Path, depths: Iterable[int]
 ) -> tuple[dict[int, Path], dict[int, VideoFrame], list[Assumption]]:
-    """Return the names and the frames of a video that belong to depth maps of these numbers.
-
-    They may belong to others if the video has another number of frames than there are maps, which is a warning.
-    """
+    """Return the names and the frames of a video that belong to depth maps of these numbers, and warnings."""
     frames, warnings = {number: VideoFrame(video, f"{number:06}", number) for number in depths}, []
     expected = max(frames) + 1
     with contextlib.suppress(ValueError), _LOCK:  # each frame says so when it is read
@@ -104,24 +101,16 @@ def _read_odometry(path: Path) -> dict[int, _Row]:
 
 
 def _geometry(folder: Path, number: int, row: _Row, text: str, size: Size) -> Geometry:
-    """Return camera and pose of a frame."""
     place = f"{folder / 'odometry.csv'}: frame {number}"
-
-    def numbers(names: tuple[str, ...]) -> list[float]:
-        came = [row.get(name, "nothing") for name in names]
-        if not (values := numbers_in(came)):
-            raise ValueError(f"{place}: expected numbers for {', '.join(names)}, got {', '.join(came):.120}")
-        return values
-
     camera, pose, notes = None, None, []
     if row:
-        values = numbers(_POSE)
+        values = named_numbers(place, row, _POSE)
         pose = from_quaternion(values[:3], values[3:], place)
     else:
         notes.append(Assumption("no pose: odometry.csv has none of the frame"))
     intrinsics: list[float] = []
     if all(row.get(name) for name in _INTRINSICS):
-        intrinsics = numbers(_INTRINSICS)
+        intrinsics = named_numbers(place, row, _INTRINSICS)
     elif text:
         notes.append(Assumption("camera: camera_matrix.csv of the whole capture; odometry.csv has none of each frame"))
         place = str(folder / "camera_matrix.csv")
