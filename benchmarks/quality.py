@@ -8,6 +8,7 @@ commas. ``stated`` is the median expected error over the median true one. ``fram
 
 from __future__ import annotations
 
+import csv
 import json
 import subprocess
 import sys
@@ -25,7 +26,7 @@ import torch
 import yaml
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import interpolate, pad
 
 from dsr.app.upsample.parts import Results
 from dsr.data.cleargrasp import ClearGrasp
@@ -35,6 +36,7 @@ from dsr.data.folder import Folder
 from dsr.data.frame_files import read_millimetres, read_picture, to_camera
 from dsr.data.icl import ICL
 from dsr.data.middlebury import Middlebury
+from dsr.data.nyu import NYU
 from dsr.data.rendered import Procedural, SimGeo
 from dsr.data.rgbdd import RGBDD
 from dsr.data.scene_source import SceneSource
@@ -47,15 +49,17 @@ from dsr.degradation.glass import add_glass
 from dsr.degradation.noise import GaussianMultiplicative, Kinect, TimeOfFlight
 from dsr.degradation.random_degradation import Everything
 from dsr.degradation.random_fields import field_of, near_steps
-from dsr.geometry.camera import Camera, RangeType
+from dsr.geometry.camera import Camera, RangeType, from_range, to_range
 from dsr.geometry.hole_size import window_maxima
 from dsr.geometry.surface import angle_between, depth_to_normals, length
 from dsr.inference import Fill, upsample_surface, upsampler
 from dsr.inference.sequences import View, fuse_views
 from dsr.io.images import read_numbers
+from dsr.methods.base import Method as BaseMethod
 from dsr.methods.base import Surface
 from dsr.methods.classical.bilateral import filter_bilateral
 from dsr.methods.networks.facets_method import SPECIAL, AnyMap, Edges
+from dsr.methods.networks.peers.peer import Peer
 from dsr.methods.networks.weight_files import read_header
 from dsr.methods.recipe import Known, Run, read_recipe
 from dsr.methods.weights import packaged_weights
@@ -70,6 +74,8 @@ from dsr.metrics.sensor import LARGEST_ERROR, SensorComparison, board_errors, co
 from dsr.pictures.depth_views import Window, normals_seen_by
 from dsr.sample import DepthSample, Scene
 from dsr.training.patches import soften
+from dsr.utils.configuration import ConfigError
+from dsr.utils.files import write_text
 
 Scores = dict[str, float]
 Method = Callable[[DepthSample], Surface]
@@ -746,15 +752,21 @@ def noise(*, shared: Path, device: str = "cpu", weights: str = "", hints: int = 
     return found
 
 
-def field(*, shared: Path, device: str = "cpu", weights: str = "", hints: int = 1, scales: str = "4,8") -> Scores:
-    """The field's benchmarks by ``metrics=field``: bicubic maps of Middlebury, Lu and RGB-D-D, soft steps."""
-    run, found, modern = AnyWeights(weights, hints=hints, device=device), {}, shared / "modern"
-    sources: tuple[tuple[SceneSource, RangeType], ...] = (
+def field_sources(shared: Path) -> list[tuple[SceneSource, RangeType]]:
+    """Return the field's benchmarks, and the range type of their levels or depths, which are downsampled."""
+    modern = shared / "modern"
+    return [
         (EightBit(str(modern / "Middlebury"), "middlebury8", "found"), "disparity"),
         (EightBit(str(modern / "Lu"), "lu", "found"), "disparity"),
         (RGBDD(str(modern / "RGBDD"), False, scenes="found"), "orthogonal"),
-    )
-    for source, kind in sources:
+        (NYU(str(modern / "NYU"), "found", split="test"), "orthogonal"),
+    ]
+
+
+def field(*, shared: Path, device: str = "cpu", weights: str = "", hints: int = 1, scales: str = "4,8") -> Scores:
+    """The field's benchmarks by ``metrics=field``: bicubic maps of Middlebury, Lu, RGB-D-D and NYU, soft steps."""
+    run, found = AnyWeights(weights, hints=hints, device=device), {}
+    for source, kind in field_sources(shared):
         for scale in map(int, scales.split(",")):
             rows = []
             for name in source.scenes():
@@ -763,6 +775,104 @@ def field(*, shared: Path, device: str = "cpu", weights: str = "", hints: int = 
                 rows.append(worst_scores(result, sample, PROTOCOLS["field"]))
             found |= {f"{source.name} x{scale} {key}": value for key, value in mean(rows).items()}
     return found
+
+
+PEERS = "cubic_convolution,facets,msg,pgsr,dctnet,dornet,fdkn,svlrm"
+ANCHORS = CONF.parent / "docs" / "measurements" / "published.csv"
+
+
+def peers(
+    *, shared: Path, device: str = "cpu", methods: str = PEERS, scales: str = "4,8,16", kernel: str = "bicubic",
+    ranges: str = "measured,truth", out: str = "",
+) -> Scores:  # fmt: skip
+    """The field's benchmarks: published figures beside ours, of its networks with their authors' weights, bicubic rows.
+
+    ``ranges`` is what a network's map is normalised by: ``(true-range)`` marks the true map's, as most authors do.
+    ``kernel`` is one of dsr's; ``aliased``, bicubic interpolation by torch without antialiasing; or ``corner``, the
+    last pixel of each block, taken for its mean. ``out`` is a file for tables: each figure of ``published.csv`` with
+    ours, and the RMSE and RMSE_v of all methods. A network without weights for a scale is left out.
+    """
+    found: dict[str, Scores] = {}
+    metrics = (*PROTOCOLS["field"], *(each for each in PAPER if each.name in ("RMSE_v", "DSSIM_v")))
+    for source, kind in field_sources(shared):
+        scenes = [source.load(name) for name in source.scenes()]
+        for scale in map(int, scales.split(",")):
+            for name in methods.split(","):
+                for label, method in peer(name, scale, kind, kernel, ranges.split(","), shared / "weights", device):
+                    samples = (field_sample(scene, scale, kind, kernel, method.range_type) for scene in scenes)
+                    scores = mean([worst_scores(method(each), each, metrics) for each in samples])
+                    found[f"{source.name} x{scale} {label}{f' ({kernel})' * (kernel != 'bicubic')}"] = {
+                        key.replace("_cm", "").replace("_levels", ""): value for key, value in scores.items()
+                    }
+    if out:
+        write_text(
+            Path(out), "\n".join([*published_table(found), "", *grid(found, "RMSE"), "", *grid(found, "RMSE_v")])
+        )
+    return {f"{title} {key}": value for title, scores in found.items() for key, value in scores.items()}
+
+
+def field_sample(scene: Scene, scale: int, kind: RangeType, kernel: str, range_type: RangeType) -> DepthSample:
+    """Return a scene with a low-resolution map that a kernel made of its levels or depth."""
+    model = Downsampling(kernel if kernel in get_args(Kernel) else "bicubic", range_type=kind)  # type: ignore[arg-type]
+    sample = make_sample(scene, scale, model, range_type)
+    if kernel == model.kernel:
+        return sample
+    assert sample.depth is not None
+    values = to_range(sample.depth, sample.camera, kind) / (scale if kind == "disparity" else 1)
+    if kernel == "corner":
+        low = values[:, scale - 1 :: scale, scale - 1 :: scale]
+    else:
+        low = interpolate(values[None], scale_factor=1 / scale, mode="bicubic")[0]
+    return replace(sample, depth_lr=from_range(low, sample.camera_lr, kind))
+
+
+def peer(
+    name: str, scale: int, kind: RangeType, kernel: str, ranges: Sequence[str], weights: Path, device: str
+) -> Iterator[tuple[str, BaseMethod]]:  # fmt: skip
+    """Yield a method as the field's protocol uses it, a published network with the ranges of :class:`Peer`."""
+    node, known = read_recipe(name).at(), Known(kernel if kernel in get_args(Kernel) else None, "soft", clean=True)
+    folder = weights / "peers" if "peer" in node else weights if name == "msg" else None
+    given: dict[str, Any] = {"range_type": kind} if "range_type" in node else {}
+    for settings in ({**given, "range": each} for each in ranges) if "range" in node else (given,):
+        recipe = read_recipe(name, settings).with_weights(folder)
+        try:
+            method = recipe.build(scale, Run(device=device, known=known))
+        except ConfigError:  # no weights for the scale
+            return
+        if not isinstance(method, Peer) or method.net.scale == scale:
+            yield f"{recipe.label}{' (true-range)' * (settings.get('range') == 'truth')}", method
+
+
+def published_table(found: Mapping[str, Scores]) -> Iterator[str]:
+    """Yield the lines of a table: each figure of ``published.csv``, in levels or cm, beside ours.
+
+    The last but one column has both over the bicubic row of the same images, which differs less between subsets.
+    """
+    yield "| benchmark | network | border | published | ours | difference, % | bicubic row | over it | from |"
+    yield "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | --- |"
+    with ANCHORS.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    for row in rows:
+        at, key = f"{row['dataset']} x{row['scale']}", "RMSE" + f"_border{row['border']}" * bool(row["border"])
+        ours, base = (found.get(f"{at} {name}", {}).get(key) for name in (row["method"], "Cubic convolution"))
+        theirs, their_base = (float(row[name]) if row[name] else None for name in ("published", "bicubic"))
+        cells = [at, row["method"], row["border"] or "-", row["published"], "-", "-", "-", "-", row["source"]]
+        if ours and base and theirs:
+            cells[4:7] = f"{ours:.3f}", f"{100 * (ours / theirs - 1):+.1f}", f"{row['bicubic'] or '-'} / {base:.3f}"
+            cells[7] = f"{theirs / their_base:.3f} / {ours / base:.3f}" if their_base else "-"
+        yield f"| {' | '.join(cells)} |"
+
+
+def grid(found: Mapping[str, Scores], key: str) -> Iterator[str]:
+    """Yield the lines of a table of one score, the scales of each benchmark in one cell."""
+    parts = [title.split(" ", 2) for title in found]
+    names, sources, scales = (list(dict.fromkeys(part[number] for part in parts)) for number in (2, 0, 1))
+    yield f"| {key}, {' / '.join(scales)} | {' | '.join(sources)} |"
+    yield "| --- |" + " --- |" * len(sources)
+    for name in names:
+        cells = [[found.get(f"{source} {scale} {name}", {}).get(key) for scale in scales] for source in sources]
+        texts = [" / ".join("-" if each is None else f"{each:.3g}" for each in cell) for cell in cells]
+        yield f"| {name} | {' | '.join(texts)} |"
 
 
 def published(
@@ -854,5 +964,5 @@ CASES: Sequence[Case] = (
     case_of(board, "board"), case_of(ddrnet_camera, "ddrnet"), case_of(rgbdd, "rgbdd"), case_of(floors, "floors"),
     case_of(phone, "phone"), case_of(edges, "edges", "all"), case_of(creases, "creases"), case_of(flicker, "flicker"),
     case_of(stated, "stated"), case_of(glass, "glass"), case_of(clear, "clear"), case_of(clean, "clean"),
-    published, kernels, noise, field, confidence,
+    published, kernels, noise, field, peers, confidence,
 )  # fmt: skip

@@ -41,6 +41,16 @@ def test_flatness_is_the_published_one(shared: Path) -> None:
     assert (raw, filtered) == (pytest.approx(36.8, abs=0.05), pytest.approx(15.8, abs=0.05))
 
 
+def test_bicubic_rows_without_the_border_are_the_published_ones(shared: Path, tmp_path: Path) -> None:
+    settings = ("methods=cubic_convolution", "scales=4", f"out={tmp_path / 'tables.md'}")
+    run_benchmark("run.py", "peers", "--shared", str(shared), "--set", *settings)
+    lines = [[cell.strip() for cell in line.split("|")] for line in (tmp_path / "tables.md").read_text().splitlines()]
+    rows = {cells[1]: cells[4:6] for cells in lines if cells[2:4] == ["Cubic convolution", "6"]}
+    for benchmark, row in (("middlebury8 x4", "2.30"), ("lu x4", "2.47")):
+        published, ours = rows[benchmark]
+        assert (published, f"{float(ours):.2f}") == (row, row)
+
+
 def test_benchmark_of_encodings_counts_what_is_said() -> None:
     printed = run_benchmark("mistakes.py", "encodings", "--frames", "2", "--reduce", "2").splitlines()
     (_, frames, *answers), _, *rows = [[cell.strip() for cell in line.split("|")[:-1]] for line in printed]

@@ -114,6 +114,8 @@ def test_splits_of_the_labelled_file_are_whole_frames_with_filled_depth(all_fram
     assert train.scenes() == [f"{number:04d}" for number in range(1, 1001)]
     assert len(whole.scenes()) == 1449
     assert (test.evaluation, train.evaluation, whole.evaluation) == (True, False, True)
+    filled = NYU(all_frames, filled=True)  # filled depth alone has mixtures at its steps
+    assert [each.soft_edges for each in (test, train, filled, whole)] == [True, True, True, False]
     scene = test.load("1001")
     assert (scene.camera, scene.depth.unique().tolist(), tuple(scene.depth.shape)) == (CAMERA, [2.0], (1, 480, 640))
 

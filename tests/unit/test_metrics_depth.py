@@ -111,10 +111,11 @@ def test_errors_of_depth_are_in_centimetres_over_all_valid_pixels():
             "MAE_cm": 100 * error.mean(),
             "Beyond_5cm": (error > 0.05).mean(),
             "Beyond_delta1": (ratio > 1.25).mean(),
+            "RMSE_cm_border6": 100 * np.sqrt(np.nanmean((p - t)[0, 6:-6, 6:-6] ** 2)),
         },
         rel=1e-12,
     )
-    assert [row.valid_share for row in rows.values()] == pytest.approx(4 * [valid.mean()])
+    assert [row.valid_share for row in rows.values()] == pytest.approx(5 * [valid.mean()])
     assert 0.02 < rows["Beyond_delta1"].value < 0.2 < rows["Beyond_5cm"].value < 0.8
 
 
@@ -128,7 +129,12 @@ def test_errors_of_disparity_are_in_levels_and_predictions_are_clamped_to_them()
     assert (levels > 256).any()
     rows = _field_rows(prediction, target, LEVELS)
     assert {name: row.value for name, row in rows.items()} == pytest.approx(
-        {"RMSE_levels": np.sqrt((error**2).mean()), "MAE_levels": error.mean()}, rel=1e-9
+        {
+            "RMSE_levels": np.sqrt((error**2).mean()),
+            "MAE_levels": error.mean(),
+            "RMSE_levels_border6": np.sqrt((error[0, 6:-6, 6:-6] ** 2).mean()),
+        },
+        rel=1e-9,
     )
     unclamped = _field_rows(prediction, target, replace(LEVELS, limits=None))
     assert unclamped["MAE_levels"].value == pytest.approx(np.abs(levels - truth).mean(), rel=1e-9)

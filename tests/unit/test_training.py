@@ -285,9 +285,11 @@ def test_validation_is_in_the_unit_of_its_benchmark(tmp_path):
     )
     sets = [_loader(WholeScenes([replace(_scene(3), unit=unit)], X2)) for unit in (levels, CENTIMETRES)]
     in_levels, in_cm = (dict(each) for each in _trainer(tmp_path).validate(module, sets, verbose=False))
-    assert {name for name in in_levels if name.startswith("val_a/")} == {"val_a/RMSE_levels", "val_a/MAE_levels"}
+    assert {name for name in in_levels if name.startswith("val_a/")} == {
+        *("val_a/RMSE_levels", "val_a/MAE_levels", "val_a/RMSE_levels_border6")
+    }
     assert {name for name in in_cm if name.startswith("val_b/")} == {
-        *("val_b/RMSE_cm", "val_b/MAE_cm", "val_b/Beyond_5cm", "val_b/Beyond_delta1")
+        *("val_b/RMSE_cm", "val_b/MAE_cm", "val_b/Beyond_5cm", "val_b/Beyond_delta1", "val_b/RMSE_cm_border6")
     }
     assert in_levels["val/RMSE_levels"] == in_levels["val_a/RMSE_levels"] > 0
 

@@ -123,7 +123,7 @@ class NYU(PreparedDataset):
         filled: bool = False,
         split: Split | None = None,
     ) -> None:
-        folder = Path(root).expanduser()
+        folder, self.soft_edges = Path(root).expanduser(), filled or split is not None
         labelled = folder / "nyu_depth_v2_labeled.mat"
         frames = find_frames(labelled) if labelled.is_file() else {}
         if split is None:

@@ -4,7 +4,8 @@
   nianticlabs/monodepth2 b676244); SIlog, iRMSE and iMAE of KITTI (Uhrig et al., 3DV 2017, its development kit); log10
   of Make3D; the accuracies at 1.05 and 1.10 of Zhang and Funkhouser, CVPR 2018.
 - ``metrics=field``: RMSE and MAE of depth super-resolution in centimetres (NYU, RGB-D-D) or in 8-bit levels
-  (Middlebury, Lu), and the fractions of pixels off by more than 5 cm or by a ratio of more than 1.25.
+  (Middlebury, Lu), the fractions of pixels off by more than 5 cm or by a ratio of more than 1.25, and, for
+  ``scores.csv`` alone, the RMSE without the six pixels at the border that DKN and those after it cut off.
 - ``metrics=normals``: mean, median and fractions below five angles of Bae and Davison, CVPR 2024 (baegwangbin/DSINE
   ef0c2af). Both normal maps are forward differences of depth; central differences have smaller angles.
 - ``metrics=points``: the pixels with both depths and all pixels with a true depth as two clouds, not thinned out.
@@ -12,7 +13,8 @@
   Temples*, SIGGRAPH 2017. *Flying pixels* (Sabov and Krueger, SCCG 2008) lie between the front and the back of true
   depth discontinuities within 16 pixels along rows and columns, and more than 1 % of their depth from every true point.
 
-Depth is neither capped nor cropped. Missing predictions are left out; the fractions ``covered`` stand beside the means.
+Otherwise depth is neither capped nor cropped. Missing predictions are left out; the fractions ``covered`` stand beside
+the means.
 """
 
 from functools import partial
@@ -23,13 +25,14 @@ from torch import Tensor
 
 from dsr.geometry.hole_size import window_maxima
 from dsr.geometry.surface import normal_mask as mask_of_normals
-from dsr.metrics.formats import Metric, column, depth_mask, normal_mask, of_parts, target_mask
+from dsr.metrics.formats import Metric, MetricFormat, column, depth_mask, normal_mask, of_parts, target_mask
 from dsr.metrics.functional import SurfacePair, angle, masked_mean, masked_median, once_per_pair
 
 _DELTAS = {"delta_105": 1.05, "delta_110": 1.1, "delta_125": 1.25, "delta_125_2": 1.25**2, "delta_125_3": 1.25**3}
 _WITHIN = {"within_5": 5, "within_7_5": 7.5, "within_11_25": 11.25, "within_22_5": 22.5, "within_30": 30}  # degrees
 EDGE_RATIO = 1.05  # of the depths of two neighbours at a discontinuity, as in Depth Pro's contours
 EDGE_RADIUS = 16  # pixels, as far as a low-resolution pixel reaches at x16
+BORDER = 6  # pixels that many papers on depth super-resolution cut off before scoring
 FLYING = 0.01  # distance of a flying pixel from every true point, as a fraction of its depth
 
 
@@ -72,6 +75,14 @@ def field_errors(pair: SurfacePair) -> dict[str, Tensor]:
         "Beyond_delta1": mean(ratio > 1.25),
     }
     return {name: value.squeeze(1) for name, value in found.items()}
+
+
+def rmse_inside(pair: SurfacePair) -> Tensor:
+    """Return the RMSE of :func:`field_errors` without a border of ``BORDER`` pixels, (B,)."""
+    inside = torch.zeros_like(pair.target_mask)
+    inside[..., BORDER:-BORDER, BORDER:-BORDER] = True
+    cut = pair.replaced(mask=inside if pair.mask is None else inside & pair.mask)
+    return field_errors(cut)[f"RMSE_{pair.unit.name}"]
 
 
 @once_per_pair
@@ -171,6 +182,7 @@ _field = {
     "Beyond_5cm": column("Beyond", "5 cm, %", 1e2, 2),
     "Beyond_delta1": column("Beyond", "1.25 x, %", 1e2, 2),
 }
+_inside = MetricFormat("RMSE", f"without {BORDER} px", position=None)  # only in scores.csv
 _levels = {"RMSE_levels": column("RMSE", "levels", digits=3), "MAE_levels": column("MAE", "levels", digits=3)}
 _covered = _fraction("Covered", "%")
 _normals_covered = {"covered": _fraction("Covered", "normals, %")}
@@ -181,6 +193,10 @@ DEPTH = (
 FIELD = (
     *of_parts("", field_errors, depth_mask, _field, min_size=1, unit="cm"),
     *of_parts("", field_errors, depth_mask, _levels, min_size=1, unit="levels"),
+    *(
+        Metric(f"RMSE_{unit}_border{BORDER}", rmse_inside, depth_mask, _inside, min_size=2 * BORDER + 1, unit=unit)
+        for unit in ("cm", "levels")
+    ),
 )
 NORMALS = (
     *of_parts("Normal_", normal_errors, normal_mask, _normal),
