@@ -222,9 +222,10 @@ class AnyRatio(Method):
         known = None if "noise" in self.recipe.settings else known_noise(sensor, noise, factor)
         if factor == 1:
             found = self._upsample(rgb, inverse, camera, None, progress, known)
-            if noise is not None and not self.recipe.settings & {"noise", "smooth"}:
-                at = found.inverse.device
-                found = found._replace(inverse=restore_measured(found.inverse, measured.to(at), noise))
+            told = self.recipe.settings & {"noise", "smooth"}
+            if noise is not None and found.noise is not None and not told:  # which is of what the network took away
+                restored = restore_measured(found.inverse, measured.to(found.inverse.device), found.noise)
+                found = found._replace(inverse=restored)
         else:
             inverse_lr = reduce_by_medians(pad_inverse_depth(inverse, factor), factor)
             ratio = factor * camera.width / inverse.shape[-1]

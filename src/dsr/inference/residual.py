@@ -25,7 +25,8 @@ _FARTHER = 8.0  # times the distance at which the noise was estimated, up to whi
 def restore_measured(inverse: Tensor, measured: Tensor, noise: MapNoise) -> Tensor:
     """Return a result's inverse depth, (1, H, W), with what it has lost of the measured one, (1, h, w), NaN in holes.
 
-    The noise is relative to the depth, and beyond the distance at which it was estimated proportional to the depth.
+    The noise is that of the residual where surfaces are calm, as facets states it: relative to the depth, and farther
+    away than the distance at which it was estimated proportional to the depth.
     """
     own = functional.adaptive_avg_pool2d(inverse, size_of(measured))
     farther = (1 / (own * noise.distance)).clamp(1, _FARTHER).nan_to_num(1)
