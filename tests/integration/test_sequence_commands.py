@@ -16,7 +16,7 @@ from upsampling import info, refused_line, upsample
 from dsr.cli import main
 from dsr.geometry.camera import Camera
 from dsr.io.depth_files import read_depth_file
-from dsr.metrics.temporal import opw
+from dsr.metrics.temporal import opw, rsd
 
 CAMERA = Camera.centred(96, 72, 90.0)
 DEPTH_ONLY = ("--method", "bicubic", "--only", "depth")
@@ -206,6 +206,8 @@ def test_results_with_poses_become_one_mesh(capture, capsys):
     expected = opw(depths.double(), Camera(**info[0]["camera"]), [np.array(each["pose"]) for each in info])
     found = re.search(r"successive results differ by ([\d.e-]+) mm, 4 pairs of a view in common \(OPW\)", said)
     assert float(found[1]) == pytest.approx(1e3 * float(expected), rel=0.01)
+    spread = rsd(depths.double(), Camera(**info[0]["camera"]), [np.array(each["pose"]) for each in info])
+    assert f"distances of points spread by {100 * float(spread):.2f} % of their mean (RSD)" in said
     mesh = trimesh.load(capture.parent / "mesh.ply", process=False)
     wall = mesh.vertices[mesh.vertices[:, 2] > 1.8]
     box = mesh.vertices[mesh.vertices[:, 2] < 1.25]

@@ -13,6 +13,7 @@ from dsr.metrics.temporal import (
     flicker,
     normal_flicker,
     opw,
+    rsd,
     temporal_noise,
     tgm,
 )
@@ -86,6 +87,18 @@ def test_exact_planes_before_a_moving_camera_agree_and_scales_that_change_differ
     approach = np.stack([np.full((20, 24), 2.0 - z) for z in (0, 0.1, 0.3)])
     assert opw(_maps(approach), CAMERA, _poses((0, 0, 0), (0, 0, 0.1), (0, 0, 0.3))).item() < 1e-9
     assert opw(_maps(approach), CAMERA, _poses(*[(0, 0, 0)] * 3)).item() == pytest.approx(0.15)
+
+
+def test_distances_spread_by_the_scales_of_the_views_alone():
+    places = [(0, 0, 0), (0.1, 0.05, 0), (0.15, 0.05, 0), (0, 0, 0.2)]
+    room = np.stack([np.full((20, 24), 2.0 - z) for _, _, z in places])
+    assert rsd(_maps(room), CAMERA, _poses(*places)).item() < 1e-9
+    scales = np.array([1.0, 1.01, 1.03, 1.09])[:, None, None]  # the last of which is another surface
+    maps, poses = _maps(scales * (2 + 0.01 * U[:1] + 0.02 * V[:1])), _poses(*[(0, 0, 0)] * 4)
+    assert rsd(maps, CAMERA, poses).item() == pytest.approx(np.std(scales[:3]) / np.mean(scales[:3]))
+    maps[0] = torch.nan
+    assert rsd(maps, CAMERA, poses).item() == pytest.approx(np.std(scales[1:3]) / np.mean(scales[1:3]))
+    assert math.isnan(rsd(maps[[1, 3]], CAMERA, poses[:2]))
 
 
 def test_warping_metric_is_that_of_scipys_interpolation_of_moved_points():

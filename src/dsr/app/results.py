@@ -3,7 +3,7 @@
 import itertools
 import math
 import webbrowser
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -38,6 +38,7 @@ _WHOLE_PAGE = 6  # the page has at most this many times the vertices of one surf
 _PHOTO, _SMALL_PHOTO, _FEW = 2048, 1024, 4  # pixels of the photos' longer side on pages of few results, and of more
 _GREY = 190
 _SEEN = 2.0  # voxels between a point and a frame's depth up to which the frame sees it
+_VIEWS = 5  # successive results over which distances are compared
 _LEAST_ERROR = 1e-4  # smallest expected error in metres that a weight distinguishes
 
 
@@ -126,6 +127,7 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
     show(console, f"{_count(frames)} -> {request.output}: {size}; in the world's frame of the poses")
     if request.score:
         show(console, f"successive results differ by {_difference(frames, max_error)} (OPW)")
+        show(console, f"distances of points spread by {_spread(recordings.values(), max_error)} of their mean (RSD)")
     return problems
 
 
@@ -153,6 +155,21 @@ def _difference(frames: Sequence[Path], max_error: float) -> str:
     known = [each for each in found if not math.isnan(each)]
     mean = show_length(float(np.mean(known))) if known else "nan"
     return f"{mean}, {len(known)} pairs of a view in common"
+
+
+def _spread(recordings: Iterable[Sequence[Path]], max_error: float) -> str:
+    """Return the mean spread of distances over a few successive views each, in per cent."""
+    from dsr.metrics.temporal import rsd  # noqa: PLC0415 - as above
+
+    found = []
+    for recording in recordings:
+        for start in range(0, len(recording), _VIEWS):
+            views = [_load(folder, max_error) for folder in recording[start : start + _VIEWS]]
+            if len(views) > 1 and len({view.camera for view in views}) == 1:
+                depths = torch.from_numpy(np.stack([view.depth for view in views]))[:, None]
+                found.append(float(rsd(depths, views[0].camera, [view.pose for view in views])))
+    known = [each for each in found if not math.isnan(each)]
+    return f"{100 * np.mean(known):.2f} %" if known else "nan"
 
 
 def _load(folder: Path, max_error: float) -> PosedMap:

@@ -222,6 +222,7 @@ def _score(study: Evaluation, scene: str, result: SceneResult) -> None:
                 sample.unit,
                 regions={name: region.to(study.device) for name, region in sample.regions.items()},
                 errors=None if errors is None else (errors[0].to(study.device), errors[1].to(study.device)),
+                measured=sample.depth_lr.to(study.device, torch.float64) if study.alignment == "none" else None,
             )
         )
         about = (sample.dataset, sample.scene, round_ratio(sample.scale), study.downsampling_name, study.method_name,

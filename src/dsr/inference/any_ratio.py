@@ -17,6 +17,7 @@ from dsr.geometry.hole_size import degrees_per_pixel, wide_holes
 from dsr.geometry.resampling import pad_inverse_depth
 from dsr.inference import DEFAULT, WIDEST, Fill
 from dsr.inference.plausibility import count_patches, expect_errors, find_outliers, within_measured
+from dsr.inference.residual import restore_measured
 from dsr.inference.resizing import (
     OWN_SIZE,
     USUAL_SCALE,
@@ -221,6 +222,10 @@ class AnyRatio(Method):
         known = None if "noise" in self.recipe.settings else known_noise(sensor, noise, factor)
         if factor == 1:
             found = self._upsample(rgb, inverse, camera, None, progress, known)
+            told = self.recipe.settings & {"noise", "smooth"}
+            if noise is not None and found.noise is not None and not told:  # which is of what the network took away
+                restored = restore_measured(found.inverse, measured.to(found.inverse.device), found.noise)
+                found = found._replace(inverse=restored)
         else:
             inverse_lr = reduce_by_medians(pad_inverse_depth(inverse, factor), factor)
             ratio = factor * camera.width / inverse.shape[-1]

@@ -84,7 +84,7 @@ def align_pair(pair: SurfacePair, how: str) -> SurfacePair:
     if pair.depth_error is not None and pair.angle_error is not None:
         errors = align_errors((pair.depth_error, pair.angle_error), prediction, aligned, how)
     depth_error, angle_error = errors or (None, None)
-    return pair.replaced(prediction=aligned, depth_error=depth_error, angle_error=angle_error)
+    return pair.replaced(prediction=aligned, depth_error=depth_error, angle_error=angle_error, measured=None)
 
 
 def _least_squares(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dsr.metrics import boundaries, calibration, depth, evalmde, functional, sensor
+from dsr.metrics import boundaries, calibration, depth, evalmde, functional, harm, sensor
 from dsr.metrics.formats import Metric, MetricFormat, depth_mask, normal_mask
 from dsr.metrics.functional import SurfacePair
 from dsr.metrics.lpips import LPIPS, MIN_SIZE, lpips_v
@@ -59,6 +59,7 @@ _FAMILIES: Mapping[str, Sequence[Metric]] = {  # each with a table of its own
     "boundaries": boundaries.METRICS,
     "calibration": calibration.METRICS,
     "plane": sensor.PLANE,
+    "harm": harm.METRICS,
 }
 PROTOCOLS: Mapping[str, tuple[Metric, ...]] = {
     "paper": METRICS,
@@ -114,19 +115,24 @@ def score_image(
     *,
     regions: Mapping[str, Tensor] | None = None,
     errors: tuple[Tensor, Tensor] | None = None,
+    measured: Tensor | None = None,
 ) -> Iterator[Score]:
     """Score one predicted depth map; NaN where no pixel can be scored.
 
     Both maps are (1, H, W) orthogonal depth in metres, NaN where missing, the rays (3, H, W), regions (1, H, W) uint8,
-    and ``errors`` the method's expected errors, (1, H, W): of depth in metres, of normals in degrees. Metrics for other
-    units, absent regions or absent errors are left out.
+    ``errors`` the method's expected errors, (1, H, W): of depth in metres, of normals in degrees, and ``measured`` the
+    low-resolution map, (1, h, w). Metrics for other units, or of what is absent, are left out.
     """
+    if measured is not None:
+        measured = harm.enlarge(measured, (target.shape[-2], target.shape[-1]))
 
     def pair_of(*window: slice) -> SurfacePair:
         at = (None, slice(None), *window)
         parts = [values[at] for values in (prediction, target, rays)]
         inside = {name: region[at] for name, region in (regions or {}).items()}
         stated = {"depth_error": errors[0][at], "angle_error": errors[1][at]} if errors else {}
+        if measured is not None:
+            stated["measured"] = measured[at]
         return SurfacePair(*parts, unit=unit, regions=inside, image_dtype=torch.float32, **stated)
 
     # Rows and columns at the border without any predicted pixel, which MSG's published networks leave out, are cut off.

@@ -91,10 +91,11 @@ class Metric:
     # whether tables of regions have it; None for means over the pixels with both depths or both normals
     regional: bool | None = None
     whole: bool = False  # whether it is of the whole image even where a method left out rows or columns at the border
-    stated: str | None = None  # the expected errors, ``depth_error`` or ``angle_error``; methods without are skipped
+    # what else of a pair it needs: ``depth_error``, ``angle_error`` or ``measured``; pairs without are skipped
+    stated: str | None = None
 
     def applies(self, pair: SurfacePair) -> bool:
-        """Return whether the metric is for the pair's benchmark, and the pair has its region and expected errors."""
+        """Return whether the metric is for the pair's benchmark, and the pair has its region and what else it needs."""
         known = self.stated is None or getattr(pair, self.stated) is not None
         return known and self.unit in (None, pair.unit.name) and (self.region is None or self.region in pair.regions)
 

@@ -56,6 +56,7 @@ class SurfacePair:
         regions: parts of the images by name, (B, 1, H, W) uint8, 0 outside, see :class:`dsr.sample.Scene`.
         depth_error, angle_error: (B, 1, H, W) expected absolute errors of the predicted depth in metres and of its
             normals in degrees, NaN where there is none; None from a method that states none.
+        measured: (B, 1, H, W) orthogonal depth in metres that a sensor measured, NaN in holes; None if it is not known.
         image_dtype: of normals and renderings, None for the depth's. float32 halves their computing time and changes
             scores by about 1e-7; depths and their differences keep their own dtype.
 
@@ -72,6 +73,7 @@ class SurfacePair:
         regions: Mapping[str, Tensor] | None = None,
         depth_error: Tensor | None = None,
         angle_error: Tensor | None = None,
+        measured: Tensor | None = None,
         image_dtype: torch.dtype | None = None,
     ) -> None:
         prediction, target = widened(prediction), widened(target)
@@ -86,7 +88,7 @@ class SurfacePair:
             raise ValueError(f"mask: expected bool of shape {tuple(shape)}, got {mask.dtype} {tuple(mask.shape)}")
         self.given, self.rays, self.mask = (prediction, target), rays.to(target.dtype), mask
         self.unit, self.regions, self.image_dtype = unit, dict(regions or {}), image_dtype or target.dtype
-        self.depth_error, self.angle_error = widened(depth_error), widened(angle_error)
+        self.depth_error, self.angle_error, self.measured = map(widened, (depth_error, angle_error, measured))
         known = target.isfinite() & (target > 0)
         self.target_mask = known if mask is None else known & mask
         self.depth_mask = self.target_mask & prediction.isfinite() & (prediction > 0)
@@ -131,7 +133,7 @@ class SurfacePair:
     def replaced(self, **changes: Any) -> SurfacePair:
         """Return a pair with other arguments; those that are not named stay."""
         prediction, target = self.given
-        names = ("rays", "mask", "unit", "regions", "depth_error", "angle_error", "image_dtype")
+        names = ("rays", "mask", "unit", "regions", "depth_error", "angle_error", "measured", "image_dtype")
         kept = {name: getattr(self, name) for name in names}
         return SurfacePair(**{"prediction": prediction, "target": target, **kept, **changes})
 

@@ -4,6 +4,7 @@
   that of IntelRealSense/librealsense (cacc8e7, ``rs-depth-quality.cpp``).
 - :func:`opw` needs poses: Wang et al., *Less Is More*, ACM MM 2022, and *Neural Video Depth Stabilizer*, ICCV 2023,
   with the rigid flow of depth and pose; RaymondWang987/NVDS (d7b66e4).
+- :func:`rsd` needs poses: the spread of one distance between two points over views, of Pumpire (2026).
 - :func:`tgm` needs a truth: temporal gradient matching of Chen et al., *Video Depth Anything*, CVPR 2025, with one
   stride; DepthAnything/Video-Depth-Anything (4f5ae23).
 
@@ -22,10 +23,12 @@ from dsr.geometry.poses import as_rigid, relative
 from dsr.geometry.resampling import source_pixels, warp_depth
 from dsr.geometry.surface import angle_between, depth_to_normals, length
 from dsr.metrics.functional import masked_mean, masked_median
+from dsr.metrics.harm import draw_pairs
 from dsr.utils.compute_device import in_own_precision
 
 Poses = Tensor | np.ndarray | Sequence[np.ndarray]
 _VISIBLE = 50.0  # how fast the weight of a pixel falls with the squared difference of its colours
+_SAME = 0.05  # relative difference of depths up to which a view sees the same point
 _MOVING = 0.05  # change of the true depth, as a fraction of the frame's range, from which on it is motion
 
 
@@ -106,6 +109,42 @@ def opw(
         error = torch.where(mask, (depths[now] - warped).abs(), 0)
         found.append((weight * error).sum() / weight.sum())
     return torch.stack(found).mean()
+
+
+@in_own_precision
+def rsd(depths: Tensor, camera: Camera, poses: Poses) -> Tensor:
+    """Return the mean over pairs of points of the standard deviation of their distance over views over its mean, ().
+
+    Pairs are drawn from the middle frame, see :func:`dsr.metrics.harm.draw_pairs`. In each view, the point is where its
+    place in the middle frame is projected to, at the depth of the nearest pixel; a view in which that differs by more
+    than 5 % does not see the point. Pairs count if two views or more see both points, NaN if none is. Larger errors are
+    thus left out, and :func:`covered` belongs beside the score.
+
+    Depths are (T, 1, H, W) orthogonal depth in metres, T at least 2, and poses as those of :func:`opw`.
+    """
+    frames = [as_rigid(np.asarray(each), f"poses: {number}") for number, each in enumerate(poses)]
+    known, middle = _known(depths), len(depths) // 2
+    if len(frames) != len(depths):
+        raise ValueError(f"poses: expected as many as the {len(depths)} depth maps, got {len(frames)}")
+    ends = torch.cat(draw_pairs(known[middle : middle + 1]), dim=1)[0]
+    points = (depths[middle].double() * camera.rays(device=depths.device)).flatten(1)[:, ends]
+    found = []
+    for depth, pose in zip(depths, frames, strict=True):
+        move = torch.from_numpy(relative(frames[middle], pose)).to(points)
+        x, y, z = move[:3, :3] @ points + move[:3, 3:]
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        inside = (z > 0) & (u > -0.5) & (v > -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
+        columns, rows = (torch.where(inside, each, 0).round().long() for each in (u, v))
+        seen = depth[0, rows, columns].double()
+        seen = seen.masked_fill(~inside | ~((seen - z).abs() <= _SAME * z), torch.nan)
+        first, second = torch.stack((x / z * seen, y / z * seen, seen)).chunk(2, dim=1)
+        found.append((first - second).square().sum(dim=0).sqrt())
+    distances = torch.stack(found)[:, None, None]  # (T, 1, 1, PAIRS)
+    there = distances.isfinite()
+    count = there.sum(dim=0, keepdim=True)
+    mean = torch.where(there, distances, 0).sum(dim=0, keepdim=True) / count
+    variance = torch.where(there, (distances - mean).square(), 0).sum(dim=0, keepdim=True) / count
+    return masked_mean(variance.sqrt() / mean, (count > 1) & (mean > 0)).squeeze()
 
 
 @in_own_precision

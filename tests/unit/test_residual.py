@@ -1,0 +1,74 @@
+"""What a result has lost of a sensor's map and gets back, on maps whose noise and lost shape are known."""
+
+import pytest
+import torch
+
+from dsr.geometry.camera import Camera
+from dsr.inference import upsampler
+from dsr.inference.residual import restore_measured
+from dsr.inference.working_size import find_noise
+from dsr.methods.base import MapNoise
+
+NOISE = MapNoise(0.004, 2.0, 2.0)
+V, U = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
+WALL = torch.full((1, 120, 160), 2.0)
+RIPPLE = 0.01 * torch.sin(U / 5) * torch.sin(V / 6)  # fine shape, metres
+RIPPLE[:, 80:] = 0
+
+
+def measure(depth, seed=0):
+    noise = torch.randn(depth.shape, generator=torch.Generator().manual_seed(seed))
+    return depth + NOISE.deviation * noise
+
+
+def restored(result, measured, noise=NOISE):
+    return restore_measured(result.reciprocal(), measured.reciprocal(), noise).reciprocal()
+
+
+def test_noise_that_was_taken_away_does_not_come_back():
+    """Residuals of white noise have about a quarter of the power that is expected of noise two pixels wide."""
+    assert torch.equal(restored(WALL, measure(WALL)), WALL)
+
+
+def test_lost_shape_comes_back_where_it_was():
+    truth = WALL + RIPPLE
+    found = restored(WALL, measure(truth)) - truth
+    lost, kept = (slice(None), slice(10, 110), slice(10, 65)), (slice(None), slice(10, 110), slice(120, 150))
+    assert float(found[lost].square().mean()) < 0.3 * float(RIPPLE[lost[1:]].square().mean())
+    assert float(found[kept].abs().max()) < 0.001
+
+
+def test_an_area_that_was_shifted_comes_back_at_any_ratio():
+    shifted, measured = WALL + 0.005, measure(WALL)
+    assert float((restored(shifted, measured) - 2).abs().mean()) < 0.001
+    small = restored(shifted.repeat_interleave(3, 1).repeat_interleave(3, 2)[:, :, :400], measured[:, :, :134])
+    assert small.shape == (1, 360, 400)
+    assert float((small - 2).abs().mean()) < 0.001
+
+
+def test_steps_outliers_and_holes_leave_the_result_as_it_is():
+    measured = measure(WALL)
+    measured[0, 30:50, 30:50] = 2.4  # a step that the result has elsewhere
+    measured[0, 60:64, 100:104] = 1.0
+    measured[0, :, 120:] = torch.nan
+    assert torch.equal(restored(WALL, measured), WALL)
+
+
+def test_noise_grows_with_distance():
+    far = 3 * WALL
+    measured = far + 3 * (measure(WALL, 1) - WALL)
+    assert torch.equal(restored(far, measured), far)
+
+
+def test_upsampling_restores_unless_the_noise_is_given_or_changed(monkeypatch):
+    camera, rgb = Camera.centred(160, 120, 150.0), torch.full((3, 120, 160), 0.5)
+    depth = measure(WALL)
+    assert find_noise(depth) is not None
+    monkeypatch.setattr("dsr.inference.any_ratio.restore_measured", lambda inverse, *_: 1.003 * inverse)
+    found = {
+        name: float(upsampler(settings=settings).upsample(rgb, depth, camera).depth.mean())
+        for name, settings in {"auto": {}, "noise": {"noise": 0.004}, "smooth": {"smooth": 2.0}}.items()
+    }
+    assert found == pytest.approx({"auto": 2 / 1.003, "noise": 2, "smooth": 2}, abs=1e-3)
+    clean = upsampler().upsample(rgb, WALL + RIPPLE, camera).depth
+    assert float((clean - WALL - RIPPLE).abs().mean()) < 0.001
