@@ -82,10 +82,9 @@ def _recur(values: Tensor, alpha: float, delta: float) -> Tensor:
     return torch.where(values.isfinite(), mean, torch.nan)
 
 
-def blend(values: Tensor, mean: Tensor, tolerance: Tensor | float, alpha: float) -> tuple[Tensor, Tensor]:
-    """Return alpha values + (1 - alpha) mean where they differ by less than a tolerance, else values; and where."""
-    agree = (values - mean).abs() < tolerance
-    return torch.where(agree, mean + alpha * (values - mean), values), agree
+def follow(values: Tensor, mean: Tensor, agree: Tensor, alpha: float) -> Tensor:
+    """Return the mean after new values: alpha values + (1 - alpha) mean where they agree, else the values."""
+    return torch.where(agree, mean.lerp(values, alpha), values)
 
 
 def filter_frames(frames: Tensor, alpha: float = 0.4, delta: float = 20.0) -> Tensor:
@@ -94,8 +93,8 @@ def filter_frames(frames: Tensor, alpha: float = 0.4, delta: float = 20.0) -> Te
     recent = torch.zeros((_RECENT, *mean.shape), dtype=torch.bool, device=mean.device)  # frames with depth, last first
     for values in frames:
         known = values.isfinite()
-        blended, agree = blend(values, mean, delta, alpha)
-        mean = torch.where(known, blended, mean)
+        agree = (values - mean).abs() < delta
+        mean = torch.where(known, follow(values, mean, agree, alpha), mean)
         found.append(mean.masked_fill(~known & (recent.sum(0) < _CREDIBLE), torch.nan))
         recent = torch.cat((known[None], recent[:-1] & (agree | ~known)))
     return torch.stack(found)
