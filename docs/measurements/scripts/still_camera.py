@@ -84,11 +84,13 @@ def main():
                     singles.append(run.upsample(photo, depth_lr, camera))
                     means.append(steady(singles[-1], photo))
                     truths.append(truth)
-                single, mean, truth = (torch.stack(each) for each in
-                                       ([s.depth for s in singles], [s.depth for s in means], truths))  # fmt: skip
                 half = options.frames // 2
-                told = [float(((s.depth - t).abs() / s.depth_error).nanmedian())
-                        for s, t in ((singles[-1], truth[-1]), (means[-1], truth[-1]))]  # fmt: skip
+                truth = torch.stack(truths)
+                single, mean = (torch.stack([each.depth for each in some]) for some in (singles, means))
+                told = [
+                    float(((depth - truth)[half:].abs() / torch.stack([s.depth_error for s in some])[half:]).nanmedian())
+                    for depth, some in ((single, singles), (mean, means))
+                ]
                 text = f"{kind} {number}: "
                 if moving:
                     text += f"error behind the ball {left_behind(mean, single, truth):.3f} of a single frame's"
