@@ -1,9 +1,8 @@
 """A floor under the flicker of a camera that stands still: an exponential mean of inverse depth over its results.
 
-It is the recursion of RealSense's temporal filter, m = alpha x + (1 - alpha) m, by which white noise of deviation s
-becomes s sqrt(alpha / (2 - alpha)). A pixel begins anew where the depth differs from the mean by more than a few
-expected errors, and beside pixels whose colour has changed. Expected errors grow to the differences that occur over
-time, so that pixels with more noise than was expected are averaged, too, after some frames.
+By RealSense's recursion, m = alpha x + (1 - alpha) m, white noise of deviation s becomes s sqrt(alpha / (2 - alpha)). A
+pixel begins anew where it differs from the mean by more than a few expected errors, and beside a change of colour.
+Expected errors grow to the differences that occur, so that pixels with more noise than expected are averaged, too.
 """
 
 import torch
@@ -31,8 +30,8 @@ class Steady:
         >>> import torch
         >>> from dsr.inference import Steady
         >>> from dsr.methods.base import Surface
-        >>> steady, photo, error = Steady(alpha=0.25), torch.zeros(3, 4, 4), torch.full((1, 4, 4), 0.01)
-        >>> maps = [steady(Surface(torch.full((1, 4, 4), z), error), photo).depth for z in (1.0, 1.02, 2.0)]
+        >>> steady, photo, one = Steady(alpha=0.25), torch.zeros(3, 4, 4), torch.ones(1, 4, 4)
+        >>> maps = [steady(Surface(z * one, 0.01 * one), photo).depth for z in (1.0, 1.02, 2.0)]
         >>> [f"{float(depth.mean()):.3f}" for depth in maps]
         ['1.000', '1.005', '2.000']
 
@@ -73,12 +72,11 @@ class Steady:
         assert surface.depth_error is not None  # noqa: S101 - see average
         known = surface.depth.isfinite()
         if surface.depth.shape != self._depth.shape:
-            self._depth, self._error, self._missing = surface.depth, surface.depth_error, (~known).to(torch.uint8)
-        else:
-            self._missing = (self._missing + 1).clamp(max=KEPT).masked_fill(known, 0)
-            new = known | (self._missing == KEPT)
-            self._depth = torch.where(new, surface.depth, self._depth)
-            self._error = torch.where(new, surface.depth_error, self._error)
+            self._depth, self._error, self._missing = surface.depth, surface.depth_error, known.to(torch.uint8)
+        self._missing = (self._missing + 1).clamp(max=KEPT).masked_fill(known, 0)
+        new = known | (self._missing == KEPT)
+        self._depth = torch.where(new, surface.depth, self._depth)
+        self._error = torch.where(new, surface.depth_error, self._error)
         self._rgb = rgb
 
 

@@ -180,10 +180,7 @@ class Upsampler:
         progress: Steps | None = None,
         steady: Steady | None = None,
     ) -> Surface[Array]:
-        """Upsample a depth map; the arguments are those of :func:`upsample`, for one picture.
-
-        ``steady``, a :class:`dsr.inference.Steady` for the frames of a camera that stands still, averages the surface
-        with those that it was given before.
+        """Upsample a depth map; the arguments are those of :func:`upsample`, for one picture, and of :meth:`stream`.
 
         Raises:
             ValueError: as there.
@@ -194,13 +191,9 @@ class Upsampler:
             return self._upsample(picture, device, progress=progress, steady=steady)
 
     def stream(
-        self,
-        frames: Iterable[tuple[Any, ...]],
-        *,
-        neighbours: int = 4,
-        unit: str | float | None = None,
+        self, frames: Iterable[tuple[Any, ...]], *, neighbours: int = 4, unit: str | float | None = None,
         steady: Steady | None = None,
-    ) -> Iterator[Surface[Any]]:
+    ) -> Iterator[Surface[Any]]:  # fmt: skip
         """Yield the surface of each frame, as they come.
 
         Frames with a pose are fused with their neighbours before, as ``dsr upsample --poses --neighbours`` does, which

@@ -65,9 +65,7 @@ class FrameChoice(Options):
         "N",
         rule=Rule("0 or a positive number of frames", lambda count: count >= 0),
     )
-    steady: bool = option(
-        False, "average successive results of a camera that stands still, against flicker", recorded=False
-    )
+    steady: bool = option(False, "average successive results of a camera that stands still", recorded=False)
     poses: Path | None = option(
         None,
         "camera poses: TUM's format, 4 x 4 matrices, or a model of COLMAP with its cameras",

@@ -316,8 +316,7 @@ class FrameWork:
         self._before.clear()
         for earlier, folder in before[-KEPT:]:
             picture = self._read(earlier)
-            surface = folder.surface(picture.camera, errors=True)
-            if surface is not None:
+            if (surface := folder.surface(picture.camera, errors=True)) is not None:
                 self._steady.remember(surface, picture.rgb)
         return self._steady
 

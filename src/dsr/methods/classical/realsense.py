@@ -1,16 +1,14 @@
 """RealSense's own filters: what the SDK of these stereo cameras does to their depth maps, with its defaults.
 
-IntelRealSense/librealsense 2.59, in the order that its documentation recommends, without the decimation, which halves
-the size: depth becomes disparity in steps of 1/32 pixel, d = 32 f B / z;
+IntelRealSense/librealsense 2.59, without its decimation: depth becomes disparity in 1/32 pixel, d = 32 f B / z;
 
 - spatial: Gastal, Oliveira, *Domain Transform for Edge-Aware Image and Video Processing*, SIGGRAPH 2011, in its
   recursive form, s_i = alpha d_i + (1 - alpha) s_(i-1) along each line, both ways, rows before columns, twice. It
-  begins anew beside a hole and where neighbours differ by ``delta`` steps or more;
-- temporal: the same recursion over frames of a camera that stands still. A hole keeps the mean if the pixel had depth
-  in two of the last four frames;
+  begins anew beside a hole and where neighbours differ by ``delta`` or more;
+- temporal: the same over frames; a hole keeps the mean if the pixel had depth in two of the last four;
 - holes: of the upper, lower and left neighbours of a hole, row by row, the farthest one.
 
-What differs: results are not rounded to whole millimetres, and sums are in another order.
+What differs: results are not rounded to whole millimetres.
 """
 
 from dataclasses import dataclass, field
@@ -54,9 +52,8 @@ class RealSense(MapFilter):
 
     def filter_map(self, sample: DepthSample) -> Tensor:
         """Return the filtered depth, (1, h, w); of a single frame, so that the temporal filter changes nothing."""
-        constant = (sample.camera_lr.baseline or self.baseline) * sample.camera_lr.fx
-        disparity = _STEPS * constant / sample.depth_lr
-        depth = _STEPS * constant / filter_lines(disparity, self.alpha, self.delta, self.iterations)
+        constant = _STEPS * (sample.camera_lr.baseline or self.baseline) * sample.camera_lr.fx
+        depth = constant / filter_lines(constant / sample.depth_lr, self.alpha, self.delta, self.iterations)
         return fill_from_farthest(depth) if self.fill_holes else depth
 
 
@@ -109,8 +106,7 @@ def fill_from_farthest(depth: Tensor) -> Tensor:
         known = values.isfinite()
         known[..., 0] = True
         start = torch.where(known, values, near).nan_to_num(0)
-        # a hole becomes the largest value since the last known pixel
         place = (start.double() + beyond * known.cumsum(-1)).cummax(-1).indices
-        row = start.gather(-1, place)
+        row = start.gather(-1, place)  # in a hole the largest value since the last known pixel
         rows.append(torch.where(row > 0, row, torch.nan))
     return torch.stack([*rows, *depth.unbind(-2)[len(rows) :]], dim=-2)
