@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 
 import cv2
 import numpy as np
@@ -13,10 +14,12 @@ from scipy.spatial.transform import Rotation
 from small_frames import in_text, walk, write_recording
 from upsampling import info, refused_line, upsample
 
+import dsr
 from dsr.cli import main
 from dsr.geometry.camera import Camera
+from dsr.inference import Steady
 from dsr.io.depth_files import read_depth_file
-from dsr.metrics.temporal import opw, rsd
+from dsr.metrics.temporal import flicker, opw, rsd
 
 CAMERA = Camera.centred(96, 72, 90.0)
 DEPTH_ONLY = ("--method", "bicubic", "--only", "depth")
@@ -189,6 +192,78 @@ def test_broken_neighbour_does_not_stop_the_others_and_a_changed_one_is_noticed(
 def test_neighbours_without_poses_are_refused(capture, capsys):
     code = upsample(capture, "--neighbours", "2", *DEPTH_ONLY, "-o", capture.parent / "out")
     assert "expected a pose for each frame" in refused_line(capsys, code)
+
+
+# a camera that stands still
+
+
+@pytest.fixture
+def still(tmp_path):
+    """Five noisy frames of a camera that stands still."""
+    rng, (photo, depth) = np.random.default_rng(0), world(CAMERA)
+    for name in ("rgb", "depth"):
+        (tmp_path / "still" / name).mkdir(parents=True)
+    for number in range(5):
+        low = depth[::2, ::2] * (1 + 0.01 * rng.standard_normal((36, 48)))
+        Image.fromarray(photo).save(tmp_path / "still" / "rgb" / f"{number:03}.png")
+        cv2.imwrite(str(tmp_path / "still" / "depth" / f"{number:03}.png"), np.round(1000 * low).astype(np.uint16))
+    (tmp_path / "still" / "camera.json").write_text(camera_json(CAMERA))
+    return tmp_path / "still"
+
+
+STEADY = ("--method", "bicubic", "--fill", "none", "--only", "depth,confidence")
+
+
+def depths(folder):
+    """Return the depth of all frames, (T, 1, H, W)."""
+    return torch.from_numpy(np.stack([read_depth_file(each / "depth_metres.tiff") for each in folders(folder)]))[
+        :, None
+    ]
+
+
+def folders(folder):
+    return sorted(path.parent for path in folder.rglob("info.json"))
+
+
+def test_steady_frames_flicker_less_and_go_on_after_an_interruption_as_if_there_were_none(still, capsys):
+    single, steady, cut = (still.parent / name for name in ("single", "steady", "cut"))
+    assert upsample(still, *STEADY, "-o", single) == 0
+    assert upsample(still, *STEADY, "--steady", "-o", steady) == 0
+    before, after = depths(single), depths(steady)
+    assert float(flicker(after)) < 0.4 * float(flicker(before))
+    assert info(steady / "003")["settings"]["steady"] is True
+    capsys.readouterr()
+    assert upsample(still, *STEADY, "-o", steady) == 2
+    assert "holds a result of other settings: steady True; take another -o" in capsys.readouterr().err
+    shutil.copytree(steady, cut)
+    for name in ("003", "004"):
+        shutil.rmtree(cut / name)
+    assert upsample(still, *STEADY, "--steady", "--with", "rgbd", "-o", cut) == 0
+    for one, other in zip(folders(steady), folders(cut), strict=True):
+        for name in ("depth_metres.tiff", "confidence.npz"):
+            assert (one / name).read_bytes() == (other / name).read_bytes(), one.name
+
+    def read():
+        for number in range(5):
+            photo = np.array(Image.open(still / "rgb" / f"{number:03}.png"))
+            yield photo, cv2.imread(str(still / "depth" / f"{number:03}.png"), cv2.IMREAD_UNCHANGED), CAMERA
+
+    stream = dsr.Upsampler("bicubic", fill="none").stream(read(), unit="mm", steady=Steady())
+    for surface, stored in zip(stream, depths(steady)[:, 0].numpy(), strict=True):
+        np.testing.assert_array_equal(surface.depth, stored)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--workers", "2"), "--steady: expected one process for all frames, got --workers or --shard"),
+        (("--shard", "1/2"), "--steady: expected one process for all frames, got --workers or --shard"),
+        (("--only", "depth"), "--steady: expected depth and confidence among the parts, which the next frame needs"),
+    ],
+)
+def test_steady_frames_are_refused_without_all_results_before(still, capsys, options, message):
+    assert message in refused_line(capsys, upsample(still, *STEADY, "--steady", *options, "-o", still.parent / "out"))
+    assert not (still.parent / "out").exists()
 
 
 # fuse

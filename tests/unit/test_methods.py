@@ -12,6 +12,7 @@ from dsr.methods.classical.edge_guided import EdgeGuided
 from dsr.methods.classical.fast_global_smoother import FastGlobalSmoother
 from dsr.methods.classical.guided_filter import GuidedFilter
 from dsr.methods.classical.interpolation import Interpolation
+from dsr.methods.classical.realsense import RealSense
 from dsr.methods.classical.tgv import TotalGeneralisedVariation
 from dsr.methods.recipe import read_recipe
 
@@ -19,7 +20,7 @@ GUIDED = {"guided_filter": GuidedFilter, "joint_bilateral": JointBilateral, "smo
 EXACT = {**GUIDED, "edge_guided": EdgeGuided}
 ORDERS = {order: partial(Interpolation, order) for order in ("nearest", "bilinear", "bicubic")}
 PLANAR = {**EXACT, "tgv": partial(TotalGeneralisedVariation, iterations=300)}
-FILLING = {**EXACT, **ORDERS, "bilateral": Bilateral}
+FILLING = {**EXACT, **ORDERS, "bilateral": Bilateral, "realsense": RealSense}
 
 
 def test_low_resolution_maps_average_what_the_paper_averages_for_a_method():

@@ -13,6 +13,7 @@ from dsr.methods.classical.edge_guided import EdgeGuided
 from dsr.methods.classical.fast_global_smoother import FastGlobalSmoother
 from dsr.methods.classical.guided_filter import GuidedFilter
 from dsr.methods.classical.interpolation import CubicConvolution, Interpolation
+from dsr.methods.classical.realsense import RealSense
 from dsr.methods.classical.shape_from_shading import ShapeFromShading
 from dsr.methods.classical.tgv import TotalGeneralisedVariation
 from dsr.methods.dip.upsampler import DeepImagePrior
@@ -35,6 +36,7 @@ WRONG = {
         ("unit", "feet"),
     ],
     Bilateral: [("window", 0), ("window", 2000), ("sigma_depth", 0), ("sigma_space", 0)],
+    RealSense: [("alpha", 0), ("alpha", 1.1), ("delta", 0), ("iterations", 0), ("baseline", 0)],
     GuidedFilter: [("radius", 0), ("radius", 2000), ("epsilon", 0)],
     JointBilateral: [("radius", 0), ("sigma_space", 0), ("sigma_colour", 0)],
     FastGlobalSmoother: [("smoothness", 0), ("sigma_colour", 0), ("iterations", 0)],

@@ -10,6 +10,7 @@ Fill = Literal["all", "small", "none"]  # which holes are filled
 # to 1 degree, and by 6 % and more beyond; half of these pixels are off by more than 2 %.
 WIDEST = 2.0
 _MODULES = {
+    "Steady": "steady",
     "find_sensor": "working_size",
     "upsample_surface": "any_ratio",
     "upsampler": "any_ratio",

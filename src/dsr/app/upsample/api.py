@@ -21,6 +21,7 @@ from dsr.inference import DEFAULT, WIDEST, Fill
 from dsr.inference.any_ratio import upsampler
 from dsr.inference.resizing import size_of
 from dsr.inference.sequences import View
+from dsr.inference.steady import Steady
 from dsr.io.cameras import doubt_camera, doubt_depth
 from dsr.io.files import python_messages
 from dsr.io.inputs import Picture
@@ -177,8 +178,9 @@ class Upsampler:
         mask: Any = None,
         unit: str | float | None = None,
         progress: Steps | None = None,
+        steady: Steady | None = None,
     ) -> Surface[Array]:
-        """Upsample a depth map; the arguments are those of :func:`upsample`, for one picture.
+        """Upsample a depth map; the arguments are those of :func:`upsample`, for one picture, and of :meth:`stream`.
 
         Raises:
             ValueError: as there.
@@ -186,11 +188,12 @@ class Upsampler:
         """
         with python_messages():
             picture, device = _read(rgb, depth, camera, mask=mask, unit=unit)
-            return self._upsample(picture, device, progress=progress)
+            return self._upsample(picture, device, progress=progress, steady=steady)
 
     def stream(
-        self, frames: Iterable[tuple[Any, ...]], *, neighbours: int = 4, unit: str | float | None = None
-    ) -> Iterator[Surface[Any]]:
+        self, frames: Iterable[tuple[Any, ...]], *, neighbours: int = 4, unit: str | float | None = None,
+        steady: Steady | None = None,
+    ) -> Iterator[Surface[Any]]:  # fmt: skip
         """Yield the surface of each frame, as they come.
 
         Frames with a pose are fused with their neighbours before, as ``dsr upsample --poses --neighbours`` does, which
@@ -203,6 +206,7 @@ class Upsampler:
                 the first one. A frame without any measurement has a surface without depth.
             neighbours: number of frames that vote on each frame's depth, 4 for two on either side; 0 for none.
             unit: of the depth's values, see :func:`upsample`.
+            steady: ``dsr.inference.Steady()`` averages successive surfaces of a camera that stands still.
 
         Raises:
             ValueError: as of :func:`upsample`, with the number of the frame.
@@ -219,10 +223,10 @@ class Upsampler:
         """
         if neighbours < 0:
             raise ValueError(f"neighbours: expected 0 or a positive number of frames, got {neighbours!r}")
-        return self._stream(frames, neighbours, unit)
+        return self._stream(frames, neighbours, unit, steady)
 
     def _stream(
-        self, frames: Iterable[tuple[Any, ...]], neighbours: int, unit: str | float | None
+        self, frames: Iterable[tuple[Any, ...]], neighbours: int, unit: str | float | None, steady: Steady | None
     ) -> Iterator[Surface[Any]]:
         """Yield surfaces; frames are read ahead for those before them, and their errors wait for their own turn."""
         source, place = enumerate(frames), 0
@@ -254,7 +258,7 @@ class Upsampler:
                 near = nearest(place, max(kept) + 1, neighbours, views.__contains__)
                 voting = [views[number] for number in near]
             with naming(f"frame {place}"), python_messages():
-                surface = self._upsample(picture, device, voting, look=place == 0)
+                surface = self._upsample(picture, device, voting, look=place == 0, steady=steady)
             yield surface
             place += 1
             kept.pop(place - neighbours - 1, None)
@@ -268,6 +272,7 @@ class Upsampler:
         progress: Steps | None = None,
         *,
         look: bool = True,
+        steady: Steady | None = None,
     ) -> Surface[Any]:
         """Return the surface of a picture on whose depth others vote; ``look`` whether photo and depth fit."""
         size, size_lr = size_of(picture.rgb), size_of(picture.depth_lr)
@@ -288,8 +293,11 @@ class Upsampler:
         warn(note for note in picture.assumptions if note.code)
         started = time.perf_counter()
         with self._lock:
-            found = self._run.upsample(picture.rgb, picture.depth_lr, picture.camera, progress, sensor)
-        return Surface(picture, as_stored(found), planned, time.perf_counter() - started, device)
+            found = as_stored(self._run.upsample(picture.rgb, picture.depth_lr, picture.camera, progress, sensor))
+        if steady is not None:
+            found = as_stored(steady.average(found, picture.rgb))
+            steady.remember(found, picture.rgb)
+        return Surface(picture, found, planned, time.perf_counter() - started, device)
 
 
 def _is_empty(picture: Picture) -> bool:

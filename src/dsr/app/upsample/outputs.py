@@ -121,8 +121,8 @@ class ResultFolder:
             names = (str(entry.get("file", name)) for name, entry in earlier["inputs"].items())
             what = f"other inputs: {', '.join(names)}"
         else:
-            before = {name: earlier["settings"].get(name) for name in self.settings}
-            changed = [name for name, value in self.settings.items() if before[name] != value]
+            before = {**dict.fromkeys(self.settings), **earlier["settings"]}
+            changed = [name for name, value in before.items() if value != self.settings.get(name)]
             said = (f"no {name}" if before[name] is None else f"{name} {before[name]}" for name in changed)
             what = f"other settings: {', '.join(said)}"
         raise ValueError(f"{self.path}: holds a result of {what}; {cure}")

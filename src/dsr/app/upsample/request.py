@@ -65,6 +65,7 @@ class FrameChoice(Options):
         "N",
         rule=Rule("0 or a positive number of frames", lambda count: count >= 0),
     )
+    steady: bool = option(False, "average successive results of a camera that stands still", recorded=False)
     poses: Path | None = option(
         None,
         "camera poses: TUM's format, 4 x 4 matrices, or a model of COLMAP with its cameras",
@@ -82,6 +83,8 @@ class FrameChoice(Options):
             raise ValueError("expected --rgb and --depth, or folders that hold both")
         if self.folders and self.mask:
             raise OptionError("mask", "expected --rgb and --depth with it, got folders")
+        if self.steady and (self.workers > 1 or self.shard is not None):
+            raise OptionError("steady", "expected one process for all frames, got --workers or --shard")
         if self.poses is not None and len(self.folders) > 1:
             raise OptionError("poses", f"expected the frames of one folder, got {len(self.folders)} folders")
 
@@ -220,6 +223,8 @@ class UpsampleRequest(Options):
         if self.frames.confidence and self.reading.min_confidence is None:
             expected = "expected --min-confidence with it, the fraction below which pixels are holes"
             raise OptionError("confidence", expected)
+        if self.frames.steady and not {"depth", "confidence"} <= {part.name for part in self.results.of_frame}:
+            raise OptionError("steady", "expected depth and confidence among the parts, which the next frame needs")
         self.upsampling.check_slowly()
 
     @functools.cached_property
@@ -232,6 +237,7 @@ class UpsampleRequest(Options):
             **recorded(self),
             "max_error": self.results.max_error / 100,
             **({"certain": True} if self.results.certain else {}),
+            **({"steady": True} if self.frames.steady else {}),
             "registered_by": None if self.reading.rig is None else "extrinsics",
             "set": self.upsampling.arguments,
             "code": hash_outside_code(list(recipe.targets())),

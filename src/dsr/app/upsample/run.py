@@ -22,6 +22,7 @@ from dsr.app.upsample.request import UpsampleRequest, Upsampling, inputs_of, inp
 from dsr.app.upsample.stored import EXPORTS, INFO, warnings_of, write_scene
 from dsr.inference.plausibility import find_filled
 from dsr.inference.resizing import size_of
+from dsr.inference.steady import KEPT, Steady
 from dsr.io.images import pixels_in_header
 from dsr.io.inputs import Picture, read_geometry, read_picture
 from dsr.io.pairs import Pair
@@ -233,6 +234,8 @@ class FrameWork:
         self._request, self._frames, self._kept = request, frames, kept
         self._pictures: OrderedDict[str, Picture] = OrderedDict()
         self._sequence = FrameSequence(frames.whole, self._read, request.frames.neighbours, request.frames.trajectory)
+        self._steady, self._recording = Steady(), Path()  # of the folder of the last frame
+        self._before: list[tuple[Pair, ResultFolder]] = []  # frames of earlier runs that it has not been told of
 
     def check_together(self, jobs: Sequence[tuple[Pair, Path]]) -> Frames:
         """Return the frames with the warnings that concern several of them, if any of the jobs is to be done."""
@@ -268,6 +271,7 @@ class FrameWork:
             self._expect_no_warning(pair, folder, warnings)
             tell(warnings)
             tell(f"{pair.name}: complete already, in {folder.path}")
+            self._before.append((pair, folder))
             return Done(pair, folder.path, "complete already", folder.size)
         begun = time.perf_counter()
         picture = self._read(pair)
@@ -284,14 +288,18 @@ class FrameWork:
         folder.expect_free(each if isinstance(each, Path) else each.file for each in sources)
         read = time.perf_counter()
         kept = folder.surface(picture.camera, errors=any(part.errors for part in wanted.of_frame))
+        steady = self._steady_before(pair) if request.frames.steady else None
         if kept is None:
             with progress.task("steps") as step:
                 surface = how.upsampler.upsample(picture.rgb, picture.depth_lr, picture.camera, step, sensor)
             surface = as_stored(surface)
             tell(_describe(surface, how))
+            surface = surface if steady is None else as_stored(steady.average(surface, picture.rgb))
             surface = surface.without_dubious(wanted.max_error / 100) if wanted.certain else surface
         else:
             surface = kept._replace(filled=find_filled(kept.depth, picture.depth_lr))
+        if steady is not None:
+            steady.remember(surface, picture.rgb)
         result = Result(picture, surface, planned, wanted, readable(pair.name))
         seconds = {"reading": read - begun, "upsampling": time.perf_counter() - read}
         tell(folder.store(result, seconds, reused=kept is not None))
@@ -299,6 +307,18 @@ class FrameWork:
         brief += [f"{time.perf_counter() - begun:.1f} s", megabytes(folder.size)]
         tell(f"{pair.name}: {', '.join(brief)} -> {folder.path}")
         return Done(pair, folder.path, "done", folder.size)
+
+    def _steady_before(self, pair: Pair) -> Steady:
+        """Return the mean of the results before a frame, of which those of earlier runs are read back."""
+        if pair.depth.parent != self._recording:
+            self._steady, self._recording = Steady(), pair.depth.parent
+        before = [each for each in self._before if each[0].depth.parent == self._recording]
+        self._before.clear()
+        for earlier, folder in before[-KEPT:]:
+            picture = self._read(earlier)
+            if (surface := folder.surface(picture.camera, errors=True)) is not None:
+                self._steady.remember(surface, picture.rgb)
+        return self._steady
 
     def _folder(self, pair: Pair, target: Path) -> ResultFolder:
         """Return the folder of a frame's results, with what these depend on."""

@@ -11,6 +11,7 @@ with Gaussians f of the distance in low-resolution pixels and g of the colour di
 weights. What differs: I_q is the mean colour over the low-resolution pixel, and the largest weight of a pixel is 1.
 """
 
+from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -30,7 +31,30 @@ _NO_WEIGHT = 10.0  # standard deviations of depth at which a pixel has no weight
 
 
 @dataclass(eq=False)
-class Bilateral(GuidedMethod):
+class MapFilter(GuidedMethod):
+    """A filter of the low-resolution depth without the photo, and its interpolation where the scale is above 1."""
+
+    abilities = Abilities(ratios="any", own_size=True, cost=Cost(150, 1))
+    slopes: bool = field(default=True, init=False)
+
+    @abstractmethod
+    def filter_map(self, sample: DepthSample) -> Tensor:
+        """Return the filtered low-resolution depth, (1, h, w) in metres."""
+
+    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
+        """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth."""
+        filtered = self.filter_map(sample)
+        if sample.scale > 1:
+            return super().__call__(replace(sample, depth_lr=filtered), progress)
+        return inpaint(filtered[None])[0] if self.fill_holes else filtered
+
+    def filter_maps(self, guided: Guided) -> Tensor:
+        """Return the interpolated maps, (N, H, W); the photo is not used."""
+        return guided.interpolate()[0]
+
+
+@dataclass(eq=False)
+class Bilateral(MapFilter):
     """The bilateral filter of the low-resolution depth, and its interpolation where the scale is above 1.
 
     The defaults suit depth cameras at 0.5 to 2 m; noise grows with distance.
@@ -44,28 +68,19 @@ class Bilateral(GuidedMethod):
 
     """
 
-    abilities = Abilities(ratios="any", own_size=True, cost=Cost(150, 1))
     range_type = "orthogonal"
 
     window: int = 19
     sigma_depth: float = 0.03
     sigma_space: float = 3.0
-    slopes: bool = field(default=True, init=False)
 
     def __post_init__(self) -> None:
         expect_window(window=self.window)
         expect_positive(sigma_depth=self.sigma_depth, sigma_space=self.sigma_space)
 
-    def __call__(self, sample: DepthSample, progress: Steps | None = None) -> Tensor:
-        """Return the high-resolution depth, (1, H, W) in metres in the precision of the low-resolution depth."""
-        filtered = filter_bilateral(sample.depth_lr, self.window, self.sigma_depth, self.sigma_space)
-        if sample.scale > 1:
-            return super().__call__(replace(sample, depth_lr=filtered), progress)
-        return inpaint(filtered[None])[0] if self.fill_holes else filtered
-
-    def filter_maps(self, guided: Guided) -> Tensor:
-        """Return the interpolated maps, (N, H, W); the photo is not used."""
-        return guided.interpolate()[0]
+    def filter_map(self, sample: DepthSample) -> Tensor:
+        """Return the filtered low-resolution depth, (1, h, w)."""
+        return filter_bilateral(sample.depth_lr, self.window, self.sigma_depth, self.sigma_space)
 
 
 def filter_bilateral(depth: Tensor, window: int, sigma_depth: float, sigma_space: float) -> Tensor:
