@@ -123,8 +123,9 @@ def score_image(
     ``errors`` the method's expected errors, (1, H, W): of depth in metres, of normals in degrees, and ``measured`` the
     low-resolution map, (1, h, w). Metrics for other units, or of what is absent, are left out.
     """
-    if measured is not None:
-        measured = harm.enlarge(measured, (target.shape[-2], target.shape[-1]))
+    needed = any(each.stated == "measured" for each in metrics)
+    size = target.shape[-2], target.shape[-1]
+    measured = harm.enlarge(measured, size) if needed and measured is not None else None
 
     def pair_of(*window: slice) -> SurfacePair:
         at = (None, slice(None), *window)
