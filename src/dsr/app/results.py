@@ -124,7 +124,8 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
     ups = {read_complete(folder)["up"] for folder in frames}
     _write(request.output, mesh, colours, ups.pop() if len(ups) == 1 else "")
     size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, voxels of {show_length(voxel)}"
-    show(console, f"{_count(frames)} -> {request.output}: {size}; in the world's frame of the poses")
+    frame = "glTF's axes" if request.output.suffix.lower() == ".glb" else "the world's frame of the poses"
+    show(console, f"{_count(frames)} -> {request.output}: {size}; in {frame}")
     if request.score:
         show(console, f"successive results differ by {_difference(frames, max_error)} (OPW)")
         show(console, f"distances of points spread by {_spread(recordings.values(), max_error)} of their mean (RSD)")
