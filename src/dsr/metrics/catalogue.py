@@ -124,8 +124,7 @@ def score_image(
     low-resolution map, (1, h, w). Metrics for other units, or of what is absent, are left out.
     """
     needed = any(each.stated == "measured" for each in metrics)
-    size = target.shape[-2], target.shape[-1]
-    measured = harm.enlarge(measured, size) if needed and measured is not None else None
+    measured = None if measured is None or not needed else harm.enlarge(measured, (target.shape[-2], target.shape[-1]))
 
     def pair_of(*window: slice) -> SurfacePair:
         at = (None, slice(None), *window)
