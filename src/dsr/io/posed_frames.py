@@ -124,7 +124,6 @@ def sample_points(frames: Sequence[Frame]) -> tuple[Points, Observed]:
 
 
 def _sample(frame: Frame, count: int) -> Points:
-    """Return the points of one of several frames."""
     camera, depth, pose = frame.camera, frame.read_certain(), frame.matrix
     step = max(1, int(np.ceil(np.sqrt(depth.size * count / _MOST))))
     at = np.s_[::step, ::step]
