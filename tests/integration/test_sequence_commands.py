@@ -253,6 +253,24 @@ def test_steady_frames_flicker_less_and_go_on_after_an_interruption_as_if_there_
         np.testing.assert_array_equal(surface.depth, stored)
 
 
+def test_steady_frames_of_two_cameras_in_turn_are_not_mixed_after_an_interruption_either(still):
+    out, rgb, maps = still.parent / "out", [], []
+    for number in range(2):
+        for camera in ("left", "right"):
+            folder = still.parent / camera
+            folder.mkdir(exist_ok=True)
+            for name, paths in (("rgb", rgb), ("depth", maps)):
+                paths.append(folder / f"{camera}_{number}.{name}.png")
+                shutil.copy(still / name / f"00{number}.png", paths[-1])
+    command = ("--rgb", *rgb, "--depth", *maps, "--camera", still / "camera.json", *STEADY, "--steady", "-o", out)
+    assert upsample(*command) == 0
+    before = depths(out)
+    [lost] = {each.parent for each in out.rglob("info.json") if "left_1" in each.parent.name}
+    shutil.rmtree(lost)
+    assert upsample(*command) == 0
+    assert torch.equal(depths(out), before)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

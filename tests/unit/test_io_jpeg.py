@@ -133,6 +133,14 @@ def test_photos_of_a_folder_are_read_unless_depth_maps_are_beside_them(tmp_path)
         find_pairs_of_folder(plain)
 
 
+def test_photos_that_differ_in_their_suffix_alone_are_both_read(tmp_path):
+    for name in ("a.JPG", "a.jpg", "b.jpeg"):
+        captures.gdepth(tmp_path / name, LEVELS)
+    found = find_pairs_of_folder(tmp_path)
+    assert {pair.rgb.name for pair in found.pairs} == {"a.JPG", "a.jpg", "b.jpeg"}
+    assert len({pair.name for pair in found.pairs}) == 3
+
+
 def test_damaged_photo_of_a_folder_leaves_the_others(tmp_path, capsys):
     captures.gdepth(tmp_path / "in" / "a.jpg", LEVELS)
     REFUSED["segment lost"][0](tmp_path / "in" / "b.jpg")

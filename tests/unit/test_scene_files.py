@@ -362,5 +362,5 @@ def test_pose_that_is_not_rigid_is_refused(value):
 def test_damaged_depth_of_a_frame_is_refused(make):
     frame = make(0)
     write_depth_file(frame.depth, np.zeros((2, 2), np.float32))
-    with pytest.raises(ValueError, match=r"depth_metres.tiff: expected depth of 8 x 12 pixels \(height x width\), got"):
+    with pytest.raises(ValueError, match=r"expected depth of 12 x 8 pixels \(width x height\), got 2 x 2"):
         frame.read_depth()

@@ -122,20 +122,22 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
         raise ValueError(f"{frames[0]}{' and others' if len(frames) > 1 else ''}: {error}") from error
     colours = _colours(mesh.vertices, frames, max_error, _SEEN * voxel, problems)
     ups = {read_complete(folder)["up"] for folder in frames}
-    _write(request.output, mesh, colours, ups.pop() if len(ups) == 1 else "")
+    frame = _write(request.output, mesh, colours, ups.pop() if len(ups) == 1 else "")
     size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, voxels of {show_length(voxel)}"
-    show(console, f"{_count(frames)} -> {request.output}: {size}; in the world's frame of the poses")
+    show(console, f"{_count(frames)} -> {request.output}: {size}; in {frame}")
     if request.score:
         show(console, f"successive results differ by {_difference(frames, max_error)} (OPW)")
         show(console, f"distances of points spread by {_spread(recordings.values(), max_error)} of their mean (RSD)")
     return problems
 
 
-def _write(path: Path, mesh: FusedMesh, colours: np.ndarray, up: str) -> None:
+def _write(path: Path, mesh: FusedMesh, colours: np.ndarray, up: str) -> str:
+    """Write a mesh, and return what its axes are."""
     if path.suffix.lower() == ".glb":
         write_glb(path, mesh.vertices, mesh.normals, mesh.faces, colours=colours, up=up)
-    else:
-        write_ply(path, mesh.vertices, colours, mesh.normals, mesh.faces, frame=world_comment(up))
+        return "glTF's axes"
+    write_ply(path, mesh.vertices, colours, mesh.normals, mesh.faces, frame=world_comment(up))
+    return "the world's frame of the poses"
 
 
 def _count(results: Sequence[object]) -> str:

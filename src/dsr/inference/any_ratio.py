@@ -224,8 +224,7 @@ class AnyRatio(Method):
             found = self._upsample(rgb, inverse, camera, None, progress, known)
             told = self.recipe.settings & {"noise", "smooth"}
             if noise is not None and found.noise is not None and not told:  # which is of what the network took away
-                restored = restore_measured(found.inverse, measured.to(found.inverse.device), found.noise)
-                found = found._replace(inverse=restored)
+                found = found._replace(inverse=restore_measured(found.inverse, measured.to(found.inverse), found.noise))
         else:
             inverse_lr = reduce_by_medians(pad_inverse_depth(inverse, factor), factor)
             ratio = factor * camera.width / inverse.shape[-1]

@@ -72,7 +72,7 @@ class Steady:
         assert surface.depth_error is not None  # noqa: S101 - see average
         known = surface.depth.isfinite()
         if surface.depth.shape != self._depth.shape:
-            self._depth, self._error, self._missing = surface.depth, surface.depth_error, known.to(torch.uint8)
+            self._depth, self._error, self._missing = surface.depth, surface.depth_error, torch.zeros_like(known).byte()
         self._missing = (self._missing + 1).clamp(max=KEPT).masked_fill(known, 0)
         new = known | (self._missing == KEPT)
         self._depth = torch.where(new, surface.depth, self._depth)

@@ -374,8 +374,9 @@ def _to_photo(
     notes += doubt_camera(rig.camera, "--depth-camera" if given else "depth camera")
     warped = warp_depth(depth_lr[None], rig.camera, torch.from_numpy(rig.transform)[None], target)[0]
     if not bool(warped.isfinite().any()):
-        text = "the transform from the depth camera's frame to the photo camera's, in metres; the photo shows nothing"
-        raise ValueError(f"{'--extrinsics' if given else _camera_source(pair, reading)}: expected {text} of the depth")
+        text = "expected the transform from the depth camera's frame to the photo camera's, in metres"
+        place = "--extrinsics" if given else _camera_source(pair, reading)
+        raise ValueError(f"{place}: {text}; with this one the photo shows nothing of the depth map")
     if given:
         inverse = torch.from_numpy(np.linalg.inv(rig.transform))[None]
         other = warp_depth(depth_lr[None], rig.camera, inverse, target)[0]

@@ -22,7 +22,7 @@ from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import whole_normals
 from dsr.io.images import read_pixels
 from dsr.utils.arrays import read_arrays
-from dsr.utils.guards import pixels_beside
+from dsr.utils.guards import expect_size, pixels_beside
 
 _MOST = 100_000  # points of all frames together
 _PINHOLE = 1  # the number of COLMAP's camera model
@@ -63,9 +63,7 @@ class Frame:
     def read_depth(self) -> np.ndarray:
         """Return the depth, (H, W) float32 in metres, NaN in holes."""
         values = read_depth_file(self.depth, pixels_beside(self.camera.height, self.camera.width))
-        if values.shape != (self.camera.height, self.camera.width):
-            size = f"{self.camera.height} x {self.camera.width}"
-            raise ValueError(f"{self.depth}: expected depth of {size} pixels (height x width), got {values.shape}")
+        expect_size(f"{self.depth}: expected depth of", values, (self.camera.height, self.camera.width))
         return values.astype(np.float32)
 
     def read_errors(self) -> np.ndarray | None:
@@ -126,7 +124,6 @@ def sample_points(frames: Sequence[Frame]) -> tuple[Points, Observed]:
 
 
 def _sample(frame: Frame, count: int) -> Points:
-    """Return the points of one of several frames."""
     camera, depth, pose = frame.camera, frame.read_certain(), frame.matrix
     step = max(1, int(np.ceil(np.sqrt(depth.size * count / _MOST))))
     at = np.s_[::step, ::step]

@@ -123,8 +123,8 @@ def score_image(
     ``errors`` the method's expected errors, (1, H, W): of depth in metres, of normals in degrees, and ``measured`` the
     low-resolution map, (1, h, w). Metrics for other units, or of what is absent, are left out.
     """
-    if measured is not None:
-        measured = harm.enlarge(measured, (target.shape[-2], target.shape[-1]))
+    needed = any(each.stated == "measured" for each in metrics)
+    measured = None if measured is None or not needed else harm.enlarge(measured, (target.shape[-2], target.shape[-1]))
 
     def pair_of(*window: slice) -> SurfacePair:
         at = (None, slice(None), *window)

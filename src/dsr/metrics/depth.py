@@ -183,6 +183,7 @@ _field = {
     "Beyond_delta1": column("Beyond", "1.25 x, %", 1e2, 2),
 }
 _inside = MetricFormat("RMSE", f"without {BORDER} px", position=None)  # only in scores.csv
+_border = partial(Metric, function=rmse_inside, mask=depth_mask, format=_inside, min_size=2 * BORDER + 1, whole=True)
 _levels = {"RMSE_levels": column("RMSE", "levels", digits=3), "MAE_levels": column("MAE", "levels", digits=3)}
 _covered = _fraction("Covered", "%")
 _normals_covered = {"covered": _fraction("Covered", "normals, %")}
@@ -193,10 +194,7 @@ DEPTH = (
 FIELD = (
     *of_parts("", field_errors, depth_mask, _field, min_size=1, unit="cm"),
     *of_parts("", field_errors, depth_mask, _levels, min_size=1, unit="levels"),
-    *(
-        Metric(f"RMSE_{unit}_border{BORDER}", rmse_inside, depth_mask, _inside, min_size=2 * BORDER + 1, unit=unit)
-        for unit in ("cm", "levels")
-    ),
+    *(_border(f"RMSE_{unit}_border{BORDER}", unit=unit) for unit in ("cm", "levels")),
 )
 NORMALS = (
     *of_parts("Normal_", normal_errors, normal_mask, _normal),

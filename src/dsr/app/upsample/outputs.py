@@ -224,7 +224,6 @@ class ResultFolder:
         return list(facts)
 
     def _write(self, info: dict[str, Any]) -> None:
-        """Write ``info.json``."""
         write_text(self.path / INFO, json.dumps(info, indent=2) + "\n")
         self.earlier = info
 

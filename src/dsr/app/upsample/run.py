@@ -7,7 +7,7 @@ import functools
 import json
 import os
 import time
-from collections import Counter, OrderedDict
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -235,7 +235,7 @@ class FrameWork:
         self._pictures: OrderedDict[str, Picture] = OrderedDict()
         self._sequence = FrameSequence(frames.whole, self._read, request.frames.neighbours, request.frames.trajectory)
         self._steady, self._recording = Steady(), Path()  # of the folder of the last frame
-        self._before: list[tuple[Pair, ResultFolder]] = []  # frames of earlier runs that it has not been told of
+        self._before: deque[tuple[Pair, ResultFolder]] = deque(maxlen=KEPT)  # complete ones that it was not told of
 
     def check_together(self, jobs: Sequence[tuple[Pair, Path]]) -> Frames:
         """Return the frames with the warnings that concern several of them, if any of the jobs is to be done."""
@@ -265,6 +265,9 @@ class FrameWork:
     def _work(self, pair: Pair, folder: ResultFolder, tell: Tell, progress: Progress) -> Done:
         """Upsample a frame that no other command is at."""
         request, wanted, how = self._request, self._request.results, self._request.upsampling
+        if pair.depth.parent != self._recording:
+            self._steady, self._recording = Steady(), pair.depth.parent
+            self._before.clear()
         folder.expect_agreement()
         if folder.done:
             warnings = warnings_of(folder.earlier)
@@ -288,7 +291,7 @@ class FrameWork:
         folder.expect_free(each if isinstance(each, Path) else each.file for each in sources)
         read = time.perf_counter()
         kept = folder.surface(picture.camera, errors=any(part.errors for part in wanted.of_frame))
-        steady = self._steady_before(pair) if request.frames.steady else None
+        steady = self._steady_before() if request.frames.steady else None
         if kept is None:
             with progress.task("steps") as step:
                 surface = how.upsampler.upsample(picture.rgb, picture.depth_lr, picture.camera, step, sensor)
@@ -308,16 +311,14 @@ class FrameWork:
         tell(f"{pair.name}: {', '.join(brief)} -> {folder.path}")
         return Done(pair, folder.path, "done", folder.size)
 
-    def _steady_before(self, pair: Pair) -> Steady:
+    def _steady_before(self) -> Steady:
         """Return the mean of the results before a frame, of which those of earlier runs are read back."""
-        if pair.depth.parent != self._recording:
-            self._steady, self._recording = Steady(), pair.depth.parent
-        before = [each for each in self._before if each[0].depth.parent == self._recording]
-        self._before.clear()
-        for earlier, folder in before[-KEPT:]:
+        for earlier, folder in self._before:
             picture = self._read(earlier)
-            if (surface := folder.surface(picture.camera, errors=True)) is not None:
-                self._steady.remember(surface, picture.rgb)
+            if (surface := folder.surface(picture.camera, errors=True)) is None:
+                raise ValueError(f"{folder.path}: expected depth and confidence, which the next frame needs, got none")
+            self._steady.remember(surface, picture.rgb)
+        self._before.clear()
         return self._steady
 
     def _folder(self, pair: Pair, target: Path) -> ResultFolder:

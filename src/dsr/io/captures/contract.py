@@ -76,7 +76,9 @@ class Capture:
         from dsr.io.pairs import join  # noqa: PLC0415 - torch takes seconds to import, and the table needs none
 
         files = sorted(filter(self.mark, files), key=natural_key)
-        return join({path.stem: of_file(path) for path in files}) if files else None
+        last = {path.stem: path for path in files}  # of a.JPG and a.jpg, the first is named with its suffix
+        parts = {path.stem if path == last[path.stem] else path.name: of_file(path) for path in files}
+        return join(parts) if parts else None
 
     def rows(self) -> dict[str, str]:
         """Return the description, text by label, the name first; empty texts are left out."""

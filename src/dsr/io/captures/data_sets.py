@@ -172,9 +172,9 @@ def _zed(path: Path, text: str, size: Size) -> Geometry:
     names = {f"LEFT_CAM_{resolution}": _ZED_CAMERA, f"RIGHT_CAM_{resolution}": _ZED_CAMERA, "STEREO": stereo}
     stored = dict(parser)
     numbers = [named_numbers(f"{path}: {each}", stored.get(each, {}), keys) for each, keys in names.items()]
+    if not np.isfinite(np.concatenate(numbers)).all():
+        raise ValueError(f"{path}: expected finite numbers, got {numbers!s:.200}")
     left, right, between = (np.array(each) for each in numbers)
-    if not np.isfinite((*left, *right, *between)).all():
-        raise ValueError(f"{path}: expected finite numbers, got others")
     matrices = [np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) for fx, fy, cx, cy, *_ in (left, right)]
     with refusing(f"{path}: expected the calibration of two cameras side by side, got another", cv2.error):
         rectified = cv2.stereoRectify(

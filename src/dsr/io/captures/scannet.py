@@ -107,7 +107,8 @@ def _read_header(path: Path, file: BufferedReader) -> _Sens:
     matrix, (colour, depth) = values[:16], values[64:66]
     wide, high, narrow, low, scale, count = values[66:]
     if colour not in (0, 1, 2) or depth not in (0, 1):
-        raise ValueError(f"{path}: expected colour as 0, 1, 2, depth as 0, 1, got compression {colour} and {depth}")
+        expected = "colour that is raw, PNG or JPEG (0, 1, 2) and depth that is raw or of zlib (0, 1)"
+        raise ValueError(f"{path}: expected {expected}, got compression {colour} and {depth}")
     if not all(1 <= side <= _LARGEST_SIDE for side in (wide, high, narrow, low)) or not 1 <= scale <= 1e6:
         got = f"{wide} x {high}, {narrow} x {low} and {scale:g}"
         raise ValueError(f"{path}: expected sizes and values per metre, got {got}")
