@@ -87,6 +87,17 @@ def test_foreign_file_in_place_of_an_export_is_left_alone(capture, tmp_path, cap
     assert (out / "open3d").read_text() == "mine"
 
 
+def test_foreign_folder_beside_the_files_of_an_older_export_is_left_alone(capture, tmp_path, capsys):
+    out, options = tmp_path / "out", ("--only", "nerfstudio", "--poses", tmp_path / "poses.txt")
+    (tmp_path / "poses.txt").write_text("".join(f"{number} 0 0 0 0 0 0 1\n" for number in range(2)))
+    (out / "normals_from_pretrain").mkdir(parents=True)
+    (out / "transforms.json").write_text("{}")
+    (out / "exports.json").write_text(json.dumps({"exports": {"transforms.json": ["transforms.json"]}}))
+    code = upsample(capture, *options, "-o", out)
+    assert "normals_from_pretrain: is there already and not of an earlier run" in refused_line(capsys, code)
+    assert upsample(capture, *options, "--overwrite", "-o", out) == 0
+
+
 def test_mesh_and_cloud_beyond_limits_are_said_and_recorded(capture, tmp_path, capsys):
     pytest.importorskip("fast_simplification", reason="pip install -e '.[mesh]'")
     out = tmp_path / "out"

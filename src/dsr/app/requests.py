@@ -100,7 +100,7 @@ class FuseRequest(Options):
     max_error: float = option(
         2.0, "leave pixels out whose depth is expected to be off by more (default: 2)", "PERCENT", rule=EXPECTED_ERROR
     )
-    score: bool = option(False, "say how far successive results differ under their poses, too; see docs/metrics.md")
+    score: bool = option(False, "say how far results differ under their poses, too (OPW, RSD); see docs/metrics.md")
 
 
 @dataclass(frozen=True, kw_only=True)

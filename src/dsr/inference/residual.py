@@ -19,6 +19,7 @@ from dsr.methods.base import MapNoise
 # their power
 _REACHES, _AROUND = (12, 3), 24
 _OUTLIER = 4.0  # standard deviations of the noise from which on a residual is of a depth step or an outlier
+_MOST = 0.5  # of the inverse depth that may be taken away
 _FARTHER = 8.0  # times the distance at which the noise was estimated, up to which it grows
 
 
@@ -42,7 +43,7 @@ def restore_measured(inverse: Tensor, measured: Tensor, noise: MapNoise) -> Tens
         power = _average(mean.square(), used, _AROUND).clamp(min=1e-20)
         lost = lost + mean * (1 - noisy / power).clamp(min=0).sqrt()
     lost = functional.interpolate(lost[None], size_of(inverse), mode="bilinear")[0]
-    return inverse * (1 + lost)
+    return inverse * (1 + lost.clamp(min=-_MOST))
 
 
 def _average(values: Tensor, weights: Tensor, reach: int) -> Tensor:

@@ -237,8 +237,9 @@ def write_scene(
         return written, [str(error)]
     for part in parts:
         name = part.files[0]
-        there = [output / each for each in part.files if (output / each).exists()]
-        if there and name not in recorded and not overwrite:
+        own = {file.split("/")[0] for file in recorded.get(name, ())}
+        there = [output / each for each in part.files if each not in own and (output / each).exists()]
+        if there and not overwrite:
             problems.append(f"{there[0]}: is there already and not of an earlier run; --overwrite replaces it")
             continue
         try:
