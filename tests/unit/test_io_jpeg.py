@@ -129,7 +129,7 @@ def test_photos_of_a_folder_are_read_unless_depth_maps_are_beside_them(tmp_path)
     captures.save(tmp_path / "a_depth.png", captures.millimetres())
     (pair,) = find_pairs_of_folder(tmp_path).pairs
     assert (pair.capture, pair.depth.name) == (None, "a_depth.png")
-    with pytest.raises(NoPairError, match=r"plain\.jpg: expected a folder, or a file with depth as .*\.jpg"):
+    with pytest.raises(NoPairError, match=r"plain\.jpg: expected a folder or depth in a file as .*\.jpg.*; got none"):
         find_pairs_of_folder(plain)
 
 

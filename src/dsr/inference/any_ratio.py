@@ -222,7 +222,7 @@ class AnyRatio(Method):
         known = None if "noise" in self.recipe.settings else known_noise(sensor, noise, factor)
         if factor == 1:
             found = self._upsample(rgb, inverse, camera, None, progress, known)
-            told = self.recipe.settings & {"noise", "smooth"}
+            told = self.recipe.at().get("noise") is not None or self.recipe.at().get("smooth", 1) != 1
             if noise is not None and found.noise is not None and not told:  # which is of what the network took away
                 found = found._replace(inverse=restore_measured(found.inverse, measured.to(found.inverse), found.noise))
         else:

@@ -70,7 +70,7 @@ def find_pairs_of_folder(folder: Path, leave: Path | None = None) -> PairingResu
     if folder.is_file():
         found = find_capture(folder)
         if found is None:
-            raise NoPairError(f"{folder}: expected a folder, or a file with depth as {', '.join(CAPTURE_FILES)}")
+            raise NoPairError(f"{folder}: expected a folder or depth in a file as {', '.join(CAPTURE_FILES)}; got none")
     elif folder.is_dir():
         found = _search(folder, None if leave is None else leave.resolve())
     else:
