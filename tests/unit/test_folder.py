@@ -146,7 +146,7 @@ STEREO = {"baseline": 0.5}
 COARSE = np.ones((1, 2))
 REFUSED = {
     "a PNG without a unit": ({"depth.png": (Z * 8).astype(np.uint16)}, {}, "/depth.png: .*depth_unit"),
-    "8 bits": ({"depth.png": np.full((H, W), 200, np.uint8)}, {"depth_unit": "mm"}, "/depth.png: expected 16-bit "),
+    "8 bits": ({"depth.png": np.full((H, W), 200, np.uint8)}, {"depth_unit": "mm"}, "/depth.png: expected 16 bits "),
     "an unknown unit": ({"depth.npy": Z}, {"depth_unit": "furlong"}, "/camera.json: depth_unit: expected m, mm or "),
     "no baseline": ({"disparity.npy": 1 / Z}, {}, '/disparity.npy: .*"baseline"'),
     "a depth of disparities": ({"depth.npy": Z}, {**STEREO, "range_type": "disparity"}, "/depth.npy: .*range_type"),

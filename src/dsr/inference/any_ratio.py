@@ -222,8 +222,9 @@ class AnyRatio(Method):
         known = None if "noise" in self.recipe.settings else known_noise(sensor, noise, factor)
         if factor == 1:
             found = self._upsample(rgb, inverse, camera, None, progress, known)
-            told = self.recipe.at().get("noise") is not None or self.recipe.at().get("smooth", 1) != 1
-            if noise is not None and found.noise is not None and not told:  # which is of what the network took away
+            set_here = self.recipe.at()
+            told = known is not None or set_here.get("noise") is not None or set_here.get("smooth", 1) != 1
+            if noise is not None and found.noise is not None and not told:
                 found = found._replace(inverse=restore_measured(found.inverse, measured.to(found.inverse), found.noise))
         else:
             inverse_lr = reduce_by_medians(pad_inverse_depth(inverse, factor), factor)
