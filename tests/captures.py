@@ -15,6 +15,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from small_files import encoded_png, written
 
 SIZE, SIZE_LR = (48, 64), (12, 16)
 INTRINSICS = (50.0, 51.0, 31.0, 24.0)
@@ -26,6 +27,11 @@ def photo(number=0):
     """A smooth photo, so that encoders keep it, (48, 64, 3) uint8 RGB; its red grows with the number."""
     y, x = np.mgrid[0:48, 0:64]
     return np.stack((40 * number + x, 2 * y + 60, x + y), -1).astype(np.uint8)
+
+
+def large_photo():
+    """The photo of four times the size, (192, 256, 3)."""
+    return photo().repeat(4, 0).repeat(4, 1)
 
 
 def depth(number=0):
@@ -576,19 +582,21 @@ def kinect(path, photos, depths, mode="MJPG", calibration=None, late=0.0):
 
 
 HEIC, HEIC_MAP = (192, 256), (48, 64)
-APPLE = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
-<rdf:Description rdf:about="" xmlns:depthData="http://ns.apple.com/depthData/1.0/">
+FLAT = np.full(HEIC_MAP, 99, np.uint8)
+XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+<rdf:Description rdf:about="" {}</rdf:Description></rdf:RDF></x:xmpmeta>"""
+APPLE = """xmlns:depthData="http://ns.apple.com/depthData/1.0/">
 <depthData:IntrinsicMatrixReferenceWidth>{width}</depthData:IntrinsicMatrixReferenceWidth>
 <depthData:IntrinsicMatrixReferenceHeight>{height}</depthData:IntrinsicMatrixReferenceHeight>
 <depthData:IntrinsicMatrix><rdf:Seq>{matrix}</rdf:Seq></depthData:IntrinsicMatrix>
-<depthData:Accuracy>{accuracy}</depthData:Accuracy></rdf:Description></rdf:RDF></x:xmpmeta>"""
+<depthData:Accuracy>{accuracy}</depthData:Accuracy>"""
 
 
 def apple_text(size=HEIC, numbers=(200.0, 201.0, 120.0, 90.0), accuracy="absolute"):
     """XMP text of a depth map as iPhones write it."""
     fx, fy, cx, cy = numbers
     matrix = "".join(f"<rdf:li>{each}</rdf:li>" for each in (fx, 0.0, 0.0, 0.0, fy, 0.0, cx, cy, 1))
-    return APPLE.format(width=size[1], height=size[0], matrix=matrix, accuracy=accuracy)
+    return XMP.format(APPLE.format(width=size[1], height=size[0], matrix=matrix, accuracy=accuracy))
 
 
 def depth_message(kind, **values):
@@ -626,7 +634,7 @@ def heic(path, levels, message=None, text="", orientation=1, reported=None):
     exif = Image.Exif()
     exif[0x0110], exif[0x0112] = "iPhone 13 Pro", orientation
     exif.get_ifd(0x8769)[0xA405] = 52
-    pixels = photo().repeat(4, 0).repeat(4, 1)
+    pixels = large_photo()
     file = pillow_heif.from_pillow(Image.fromarray(pixels))
     file.add_from_pillow(Image.fromarray(levels))
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -681,14 +689,9 @@ def heic(path, levels, message=None, text="", orientation=1, reported=None):
     return path
 
 
-_XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
-<rdf:Description rdf:about="" {}</rdf:Description></rdf:RDF></x:xmpmeta>"""
-
-
-def encoded(pixels, suffix=".png", **exif):
-    """A picture, grey or RGB, as the bytes of a PNG or JPEG."""
+def encoded_jpeg(pixels, **options):
     content = io.BytesIO()
-    Image.fromarray(pixels).save(content, {".png": "PNG", ".jpg": "JPEG"}[suffix], quality=98, **exif)
+    Image.fromarray(pixels).save(content, "JPEG", quality=98, **options)
     return content.getvalue()
 
 
@@ -701,32 +704,28 @@ def with_xmp(photo, standard, extended="", swap=False):
         for place in range(0, len(extended), size):
             head = guid.encode() + struct.pack(">II", len(extended), place)
             parts.append(b"http://ns.adobe.com/xmp/extension/\0" + head + extended[place : place + size].encode())
-    parts = [b"http://ns.adobe.com/xap/1.0/\0" + _XMP.format(standard).encode(), *(parts[::-1] if swap else parts)]
+    parts = [b"http://ns.adobe.com/xap/1.0/\0" + XMP.format(standard).encode(), *(parts[::-1] if swap else parts)]
     return photo[:2] + b"".join(b"\xff\xe1" + struct.pack(">H", len(each) + 2) + each for each in parts) + photo[2:]
 
 
-def gdepth(path, levels, *, confidence=None, original=None, extended=True, swap=False, file=None, **values):
+def gdepth(path, levels, confidence=None, *, original=b"", extended=True, swap=False, file=b"", **values):
     """Write a JPEG with GDepth: near and far are 0.5 and 4 m unless ``values`` say else, empty ones are left out."""
-    keys = {"Format": "RangeInverse", "Near": 0.5, "Far": 4.0, "Units": "m", "ImageWidth": 256, **values}
-    sure = b"" if confidence is None else encoded(confidence)
-    data = {"GDepth:Data": encoded(levels), "GDepth:Confidence": sure, "GImage:Data": original}
+    keys = {"Format": "RangeInverse", "Near": 0.5, "Far": 4.0, "Units": "m", **values}
+    sure = b"" if confidence is None else encoded_png(confidence)
+    data = {"GDepth:Data": encoded_png(levels), "GDepth:Confidence": sure, "GImage:Data": original}
     large = " ".join(f'{name}="{base64.b64encode(each).decode()}"' for name, each in data.items() if each)
-    names = 'xmlns:GDepth="http://ns.google.com/photos/1.0/depthmap/" '
-    names += " ".join(f'GDepth:{name}="{value}"' for name, value in keys.items() if value != "")
-    file = encoded(photo().repeat(4, 0).repeat(4, 1), ".jpg") if file is None else file
-    large = _XMP.format(f"{large}>") if extended else large
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(with_xmp(file, f"{names}>", large, swap) if extended else with_xmp(file, f"{names} {large}>"))
-    return path
+    small = " ".join(f'GDepth:{name}="{value}"' for name, value in keys.items() if value != "")
+    small = f'xmlns:GDepth="http://ns.google.com/photos/1.0/depthmap/" {small}'
+    text = (f"{small}>", XMP.format(f"{large}>")) if extended else (f"{small} {large}>",)
+    return written(path, with_xmp(file or encoded_jpeg(large_photo()), *text, swap=swap))
 
 
 def dynamic_depth(path, levels, confidence=None, *, original=None, model="", padding=0, progressive=False, **values):
     """Write a JPEG with Dynamic Depth, whose maps lie behind the photo, as Android writes it: all in extended XMP."""
-    photo_file = encoded(photo().repeat(4, 0).repeat(4, 1), ".jpg", progressive=progressive)
     keys = {"Format": "RangeInverse", "Near": 0.5, "Far": 4.0, "Units": "Meters", "DepthURI": "android/depthmap",
             **({} if confidence is None else {"ConfidenceURI": "android/confidencemap"}), **values}  # fmt: skip
-    items = {"android/mainimage": b"", "android/original": original, "android/depthmap": encoded(levels),
-             "android/confidencemap": None if confidence is None else encoded(confidence)}  # fmt: skip
+    items = {"android/mainimage": b"", "android/original": original, "android/depthmap": encoded_png(levels),
+             "android/confidencemap": None if confidence is None else encoded_png(confidence)}  # fmt: skip
     items = {name: content for name, content in items.items() if content is not None}
     directory = "".join(
         f'<rdf:li rdf:parseType="Resource"><Container:Item Item:Mime="image/png" Item:Length="{len(content)}" '
@@ -740,17 +739,17 @@ def dynamic_depth(path, levels, confidence=None, *, original=None, model="", pad
         f'<Device:Cameras><rdf:Seq><rdf:li><Device:Camera Camera:Trait="Physical"><Camera:Image Image:ItemURI="{uri}"/>'
         f"<Camera:DepthMap {depth_map}/>{model}</Device:Camera></rdf:li></rdf:Seq></Device:Cameras>"
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    files = b"".join(content + bytes(padding) for content in items.values())
-    path.write_bytes(with_xmp(photo_file, ">", _XMP.format(text)) + files)
-    return path
+    photo_file = encoded_jpeg(large_photo(), progressive=progressive)
+    behind = b"".join(content + bytes(padding) for content in items.values())
+    return written(path, with_xmp(photo_file, ">", XMP.format(text)) + behind)
 
 
-IMAGING_MODEL = (
-    '<Camera:ImagingModel ImagingModel:FocalLengthX="200" ImagingModel:FocalLengthY="201" '
-    'ImagingModel:ImageWidth="256" ImagingModel:ImageHeight="192" ImagingModel:PrincipalPointX="{}" '
-    'ImagingModel:PrincipalPointY="{}"/>'
-)
+def imaging_model(column=0.5, row=0.5):
+    return (
+        '<Camera:ImagingModel ImagingModel:FocalLengthX="200" ImagingModel:FocalLengthY="201" '
+        'ImagingModel:ImageWidth="256" ImagingModel:ImageHeight="192" '
+        f'ImagingModel:PrincipalPointX="{column}" ImagingModel:PrincipalPointY="{row}"/>'
+    )
 
 
 def zed(folder, fx=700.0, **changes):
@@ -809,12 +808,8 @@ FOLDERS = {
     "ros 2 packed": lambda folder: ros(folder / "recording", 2, packed=True),
     "ros 2 mcap": lambda folder: ros(folder / "recording", 2, plugin="MCAP"),
     "kinect": lambda folder: kinect(folder / "scan.mkv", [photo()] * 2, [np.full(KINECT_DEPTH, 1000, np.uint16)] * 2),
-    "gdepth": lambda folder: gdepth(
-        folder / "photo.jpg", np.full(HEIC_MAP, 99, np.uint8), confidence=np.full(HEIC_MAP, 200, np.uint8)
-    ),
-    "dynamic depth": lambda folder: dynamic_depth(
-        folder / "photo.jpg", np.full(HEIC_MAP, 99, np.uint8), model=IMAGING_MODEL.format(0.5, 0.5)
-    ),
-    "heic": lambda folder: heic(folder / "photo.heic", np.full(HEIC_MAP, 99, np.uint8), text=apple_text()),
+    "gdepth": lambda folder: gdepth(folder / "photo.jpg", FLAT, FLAT),
+    "dynamic depth": lambda folder: dynamic_depth(folder / "photo.jpg", FLAT, model=imaging_model()),
+    "heic": lambda folder: heic(folder / "photo.heic", FLAT, text=apple_text()),
 }
 """What writes each kind of capture into a folder."""

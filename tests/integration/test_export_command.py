@@ -3,7 +3,6 @@
 import json
 import struct
 
-import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -11,6 +10,7 @@ from small_frames import write_frames
 from upsampling import refused_line, upsample
 
 from dsr.app.upsample import run
+from dsr.io.depth_files import read_depth_file
 
 
 @pytest.fixture
@@ -18,19 +18,25 @@ def capture(tmp_path):
     return write_frames(tmp_path / "capture", 2, holes=0)
 
 
+@pytest.fixture
+def poses(tmp_path):
+    """Poses of the frames, one metre to the right of each other."""
+    (tmp_path / "poses.txt").write_text("".join(f"{number} {number} 2 3 0 0 0 1\n" for number in range(2)))
+    return ("--poses", tmp_path / "poses.txt")
+
+
 def names_in(folder):
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_exports_are_written_beside_the_frames_and_again_after_a_resumption(capture, tmp_path, capsys):
-    out, poses = tmp_path / "out", tmp_path / "poses.txt"
-    poses.write_text("".join(f"{number} {number} 0 0 0 0 0 1\n" for number in range(2)))
-    assert upsample(capture, "--poses", poses, "--only", "open3d,stereo,rgbd_picture", "-o", out) == 0
+def test_exports_are_written_beside_the_frames_and_again_after_a_resumption(capture, poses, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert upsample(capture, *poses, "--only", "open3d,stereo,rgbd_picture", "-o", out) == 0
     said = capsys.readouterr().out
     assert f"open3d: 2 frames -> {out / 'open3d'}" in said
     frame = {"info.json", "depth.png", "depth_metres.tiff", "rgbd/color.png", "rgbd/depth.png", "rgbd/intrinsic.json"}
     assert names_in(out / "000") == {*frame, "stereo_2x1.jpg", "rgbd_2x1.png"}
-    assert upsample(capture, "--poses", poses, "--only", "open3d,nerfstudio,gaussian", "-o", out) == 0
+    assert upsample(capture, *poses, "--only", "open3d,nerfstudio,gaussian", "-o", out) == 0
     assert "2 complete already" in capsys.readouterr().out
     assert "open3d/trajectory.log" in names_in(out)
     frames = json.loads((out / "transforms.json").read_text())["frames"]
@@ -51,12 +57,11 @@ def test_frames_without_poses_are_refused_before_anything_is_computed(capture, t
     assert not (tmp_path / "out").exists()
 
 
-def test_poses_of_a_file_are_those_of_the_exports_whichever_frame_ends_first(capture, tmp_path, monkeypatch):
+def test_poses_of_a_file_are_those_of_the_exports_whichever_frame_ends_first(capture, poses, tmp_path, monkeypatch):
     in_order = run.work_through
     monkeypatch.setattr(run, "work_through", lambda *arguments: reversed(list(in_order(*arguments))))
-    (tmp_path / "poses.txt").write_text("".join(f"{number} {number} 2 3 0 0 0 1\n" for number in range(2)))
     out = tmp_path / "out"
-    assert upsample(capture, "--only", "open3d,nerfstudio,gaussian", "--poses", tmp_path / "poses.txt", "-o", out) == 0
+    assert upsample(capture, "--only", "open3d,nerfstudio,gaussian", *poses, "-o", out) == 0
     rows = (out / "open3d/trajectory.log").read_text().splitlines()  # the n-th is that of the n-th photo
     assert [row.split()[3] for row in (rows[1], rows[6])] == ["0", "1"]
     frames = json.loads((out / "transforms.json").read_text())["frames"]
@@ -64,18 +69,15 @@ def test_poses_of_a_file_are_those_of_the_exports_whichever_frame_ends_first(cap
     assert {"cameras.bin", "images.bin", "points3D.bin"} <= names_in(out / "gaussian/sparse/0")
 
 
-def test_points_for_splatting_are_pixels_that_are_expected_to_be_right(capture, tmp_path):
-    (tmp_path / "poses.txt").write_text("".join(f"{number} 0 0 0 0 0 0 1\n" for number in range(2)))
-    options, out = ("--poses", tmp_path / "poses.txt", "--method", "bicubic", "--max-error", 0.5), tmp_path / "out"
-    assert upsample(capture, *options, "--only", "confidence,gaussian", "-o", out) == 0
+def test_points_for_splatting_are_pixels_that_are_expected_to_be_right(capture, poses, tmp_path):
+    options, out = ("--method", "bicubic", "--max-error", 0.5, "--only", "confidence,gaussian"), tmp_path / "out"
+    assert upsample(capture, *poses, *options, "-o", out) == 0
     certain = 0
-    for number in range(2):
-        depth = cv2.imread(str(out / f"{number:03}" / "depth_metres.tiff"), cv2.IMREAD_UNCHANGED)
-        errors = np.load(out / f"{number:03}" / "confidence.npz")["depth_error"].astype(np.float32)
-        certain += int((errors <= 0.005 * depth).sum())
+    for frame in (out / "000", out / "001"):
+        depth = read_depth_file(frame / "depth_metres.tiff")
+        certain += int((np.load(frame / "confidence.npz")["depth_error"].astype(np.float32) <= 0.005 * depth).sum())
     assert 0 < certain < 2 * 24 * 32
-    (written,) = struct.unpack("<Q", (out / "gaussian/sparse/0/points3D.bin").read_bytes()[:8])
-    assert written == certain
+    assert (out / "gaussian/sparse/0/points3D.bin").read_bytes()[:8] == struct.pack("<Q", certain)
 
 
 def test_foreign_file_in_place_of_an_export_is_left_alone(capture, tmp_path, capsys):
@@ -87,9 +89,8 @@ def test_foreign_file_in_place_of_an_export_is_left_alone(capture, tmp_path, cap
     assert (out / "open3d").read_text() == "mine"
 
 
-def test_foreign_folder_beside_the_files_of_an_older_export_is_left_alone(capture, tmp_path, capsys):
-    out, options = tmp_path / "out", ("--only", "nerfstudio", "--poses", tmp_path / "poses.txt")
-    (tmp_path / "poses.txt").write_text("".join(f"{number} 0 0 0 0 0 0 1\n" for number in range(2)))
+def test_foreign_folder_beside_the_files_of_an_older_export_is_left_alone(capture, poses, tmp_path, capsys):
+    out, options = tmp_path / "out", ("--only", "nerfstudio", "--method", "bicubic", *poses)
     (out / "normals_from_pretrain").mkdir(parents=True)
     (out / "transforms.json").write_text("{}")
     (out / "exports.json").write_text(json.dumps({"exports": {"transforms.json": ["transforms.json"]}}))

@@ -48,21 +48,25 @@ def camera_json(camera):
     return json.dumps({name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")})
 
 
-@pytest.fixture
-def capture(tmp_path):
-    """Five frames with noise, from cameras 4 cm apart, and their poses."""
-    folder = tmp_path / "capture"
+def write_capture(folder, apart):
+    """Write five frames with noise, from cameras that far apart."""
     rng = np.random.default_rng(0)
     for name in ("rgb", "depth"):
         (folder / name).mkdir(parents=True)
     for number in range(5):
-        photo, depth = world(CAMERA, 0.04 * number)
+        photo, depth = world(CAMERA, apart * number)
         low = depth.reshape(36, 2, 48, 2).mean((1, 3)) * (1 + 0.01 * rng.standard_normal((36, 48)))
         Image.fromarray(photo).save(folder / "rgb" / f"{number:03}.png")
         cv2.imwrite(str(folder / "depth" / f"{number:03}.png"), np.round(1000 * low).astype(np.uint16))
     (folder / "camera.json").write_text(camera_json(CAMERA))
-    (tmp_path / "poses.txt").write_text("".join(text(pose(0.04 * number)) for number in range(5)))
     return folder
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """Frames from cameras 4 cm apart, and their poses."""
+    (tmp_path / "poses.txt").write_text("".join(text(pose(0.04 * number)) for number in range(5)))
+    return write_capture(tmp_path / "capture", 0.04)
 
 
 # a depth camera elsewhere
@@ -199,16 +203,7 @@ def test_neighbours_without_poses_are_refused(capture, capsys):
 
 @pytest.fixture
 def still(tmp_path):
-    """Five noisy frames of a camera that stands still."""
-    rng, (photo, depth) = np.random.default_rng(0), world(CAMERA)
-    for name in ("rgb", "depth"):
-        (tmp_path / "still" / name).mkdir(parents=True)
-    for number in range(5):
-        low = depth[::2, ::2] * (1 + 0.01 * rng.standard_normal((36, 48)))
-        Image.fromarray(photo).save(tmp_path / "still" / "rgb" / f"{number:03}.png")
-        cv2.imwrite(str(tmp_path / "still" / "depth" / f"{number:03}.png"), np.round(1000 * low).astype(np.uint16))
-    (tmp_path / "still" / "camera.json").write_text(camera_json(CAMERA))
-    return tmp_path / "still"
+    return write_capture(tmp_path / "still", 0)
 
 
 STEADY = ("--method", "bicubic", "--fill", "none", "--only", "depth,confidence")
@@ -216,13 +211,8 @@ STEADY = ("--method", "bicubic", "--fill", "none", "--only", "depth,confidence")
 
 def depths(folder):
     """Return the depth of all frames, (T, 1, H, W)."""
-    return torch.from_numpy(np.stack([read_depth_file(each / "depth_metres.tiff") for each in folders(folder)]))[
-        :, None
-    ]
-
-
-def folders(folder):
-    return sorted(path.parent for path in folder.rglob("info.json"))
+    maps = [read_depth_file(path) for path in sorted(folder.rglob("depth_metres.tiff"))]
+    return torch.from_numpy(np.stack(maps))[:, None]
 
 
 def test_steady_frames_flicker_less_and_go_on_after_an_interruption_as_if_there_were_none(still, capsys):
@@ -239,9 +229,8 @@ def test_steady_frames_flicker_less_and_go_on_after_an_interruption_as_if_there_
     for name in ("003", "004"):
         shutil.rmtree(cut / name)
     assert upsample(still, *STEADY, "--steady", "--with", "rgbd", "-o", cut) == 0
-    for one, other in zip(folders(steady), folders(cut), strict=True):
-        for name in ("depth_metres.tiff", "confidence.npz"):
-            assert (one / name).read_bytes() == (other / name).read_bytes(), one.name
+    for path in (*steady.rglob("depth_metres.tiff"), *steady.rglob("confidence.npz")):
+        assert path.read_bytes() == (cut / path.relative_to(steady)).read_bytes(), path
 
     def read():
         for number in range(5):
@@ -275,8 +264,8 @@ def test_steady_frames_of_two_cameras_in_turn_are_not_mixed_after_an_interruptio
     ("options", "message"),
     [
         (("--workers", "2"), "--steady: expected one process for all frames, got --workers or --shard"),
-        (("--shard", "1/2"), "--steady: expected one process for all frames, got --workers or --shard"),
-        (("--only", "depth"), "--steady: expected depth and confidence among the parts, which the next frame needs"),
+        (("--shard", "1/2"), "--steady: expected one process for all frames"),
+        (("--only", "depth"), "--steady: expected depth and confidence among the parts"),
     ],
 )
 def test_steady_frames_are_refused_without_all_results_before(still, capsys, options, message):
@@ -294,13 +283,12 @@ def test_results_with_poses_become_one_mesh(capture, capsys):
     said = " ".join(capsys.readouterr().out.split())
     assert "5 results -> " in said
     folders = sorted(path.parent for path in out.rglob("info.json"))
-    depths = torch.from_numpy(np.stack([read_depth_file(each / "depth_metres.tiff") for each in folders]))[:, None]
     info = [json.loads((each / "info.json").read_text()) for each in folders]
-    expected = opw(depths.double(), Camera(**info[0]["camera"]), [np.array(each["pose"]) for each in info])
+    views = depths(out).double(), Camera(**info[0]["camera"]), [np.array(each["pose"]) for each in info]
+    expected = opw(*views)
     found = re.search(r"successive results differ by ([\d.e-]+) mm, 4 pairs of a view in common \(OPW\)", said)
     assert float(found[1]) == pytest.approx(1e3 * float(expected), rel=0.01)
-    spread = rsd(depths.double(), Camera(**info[0]["camera"]), [np.array(each["pose"]) for each in info])
-    assert f"distances of points spread by {100 * float(spread):.2f} % of their mean (RSD)" in said
+    assert f"distances of points spread by {100 * float(rsd(*views)):.2f} % of their mean (RSD)" in said
     mesh = trimesh.load(capture.parent / "mesh.ply", process=False)
     wall = mesh.vertices[mesh.vertices[:, 2] > 1.8]
     box = mesh.vertices[mesh.vertices[:, 2] < 1.25]

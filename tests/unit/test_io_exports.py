@@ -249,30 +249,27 @@ def test_large_photos_are_stored_smaller(tmp_path):
     assert read_input(tmp_path / "input.npz")[0].shape == (15, LONGEST, 3)
 
 
-def views(path, rgb, depth, camera):
-    notes = write_stereo(path, rgb, depth, camera)
+def views(path, rgb, depth):
+    notes = write_stereo(path, rgb, depth, Camera(450, 40, 300, 300, 224.5, 19.5))
     return *np.split(read(path).astype(float), 2, axis=1), notes[0].detail
 
 
 @pytest.mark.parametrize(("metres", "apart"), [(2.0, 0.063), (0.5, 0.025)])
 def test_right_view_of_a_wall_is_shifted_by_focal_length_times_distance_over_depth(tmp_path, metres, apart):
     """Of the near wall 1/30 of the width, 15 pixels."""
-    camera = Camera(450, 40, 300, 300, 224.5, 19.5)
-    shift = 300 * apart / metres
-    waves = [0.5 + 0.4 * np.sin((np.arange(450) + each) / 5) for each in (0, shift)]
+    waves = [0.5 + 0.4 * np.sin((np.arange(450) + shift) / 5) for shift in (0, 300 * apart / metres)]
     rgb = torch.from_numpy(waves[0]).expand(3, 40, 450)
-    left, right, detail = views(tmp_path / "a.jpg", rgb, torch.full((1, 40, 450), metres), camera)
+    left, right, detail = views(tmp_path / "a.jpg", rgb, torch.full((1, 40, 450), metres))
     assert detail == f"{1000 * apart:g} mm"
     np.testing.assert_allclose(left, np.broadcast_to(255 * waves[0][:, None], left.shape), atol=3)
     np.testing.assert_allclose(right[:, :432], np.broadcast_to(255 * waves[1][:432, None], (40, 432, 3)), atol=4)
 
 
 def test_near_things_hide_others_and_what_they_uncover_is_background(tmp_path):
-    camera = Camera(450, 40, 300, 300, 224.5, 19.5)
     depth, rgb = torch.full((1, 40, 450), 1e6), torch.zeros(3, 40, 450)
     rgb[1], depth[..., 200:280], rgb[:, :, 200:280] = 1, 300 * 0.063 / 15, torch.tensor([1.0, 0, 0])[:, None, None]
     depth[:, 5:9, 100:230] = torch.nan  # behind what is beside it: the background
-    right = views(tmp_path / "a.jpg", rgb, depth, camera)[1]
+    right = views(tmp_path / "a.jpg", rgb, depth)[1]
     red = (right[..., 0] > right[..., 1])[20:30]
     assert np.argwhere(red.all(0)).ravel().tolist() == [*range(185, 265)]
     assert red.any(0).sum() == 80

@@ -45,7 +45,7 @@ def only(path):
 def test_depth_is_in_metres(tmp_path, message, expected):
     picture = only(write(tmp_path / "photo.heic", message=message))
     np.testing.assert_allclose(picture.depth_lr[0], expected, rtol=1e-5)
-    assert np.abs(255 * picture.rgb.permute(1, 2, 0).numpy() - captures.photo().repeat(4, 0).repeat(4, 1)).mean() < 3
+    assert np.abs(255 * picture.rgb.permute(1, 2, 0).numpy() - captures.large_photo()).mean() < 3
     assert picture.assumptions == ()
 
 
@@ -110,7 +110,7 @@ def test_photo_of_a_pair_may_be_heic_and_is_turned_as_its_jpeg_would_be(tmp_path
     path = write(tmp_path / "photo.heic", orientation=orientation)
     exif = Image.Exif()
     exif[0x0112] = orientation
-    stored = captures.photo().repeat(4, 0).repeat(4, 1)
+    stored = captures.large_photo()
     Image.fromarray(stored).save(tmp_path / "photo.jpg", exif=exif, quality=98, subsampling=0)
     depth = np.rot90(captures.depth(), quarters if upright else 0)
     np.save(tmp_path / "depth.npy", depth)
@@ -127,7 +127,7 @@ def test_photo_of_a_pair_may_be_heic_and_is_turned_as_its_jpeg_would_be(tmp_path
 @pytest.mark.parametrize(("orientation", "reported"), [(each, r) for each in range(1, 9) for r in (1, each, 9 - each)])
 def test_photo_is_turned_back_as_its_decoder_turned_it_whatever_the_exif_data_say(tmp_path, orientation, reported):
     path = write(tmp_path / "photo.heic", orientation=orientation, reported=reported)
-    stored = captures.photo().repeat(4, 0).repeat(4, 1)
+    stored = captures.large_photo()
     np.save(tmp_path / "depth.npy", captures.depth())
     found = read_photo(path, captures.depth().shape)[0].astype(float)
     if reported == 1:

@@ -7,7 +7,8 @@ import captures
 import numpy as np
 import pytest
 import torch
-from captures import IMAGING_MODEL, encoded
+from captures import encoded_jpeg, imaging_model
+from small_files import encoded_png, written
 from upsampling import upsample
 
 from dsr.io.inputs import read_picture
@@ -31,20 +32,22 @@ def said(picture):
 
 @pytest.mark.parametrize("write", [captures.gdepth, captures.dynamic_depth])
 @pytest.mark.parametrize(
-    ("values", "expected"),
+    ("values", "expected", "relative"),
     [
-        ({}, INVERSE),
-        ({"Format": "RangeLinear"}, 0.5 + 3.5 * SHARES),
-        ({"Units": "mm", "Near": 500.0, "Far": 4000.0}, INVERSE),
-        ({"Units": "Diopters", "Near": 2.0, "Far": 0.25, "Format": "RangeLinear"}, INVERSE),
+        ({}, INVERSE, ""),
+        ({"Format": "RangeLinear"}, 0.5 + 3.5 * SHARES, ""),
+        ({"Units": "mm", "Near": 500.0, "Far": 4000.0}, INVERSE, ""),
+        ({"Units": "Diopters", "Near": 2.0, "Far": 0.25, "Format": "RangeLinear"}, INVERSE, ""),
+        ({"Units": ""}, INVERSE, "the depth may be relative, the file does not"),
+        ({"Units": "None"}, INVERSE, "the depth is relative, as the"),
     ],
-    ids=["inverse", "linear", "millimetres", "dioptres"],
 )
-def test_depth_is_in_metres(tmp_path, write, values, expected):
+def test_depth_is_in_metres_or_said_to_be_relative(tmp_path, write, values, expected, relative):
     picture = only(write(tmp_path / "photo.jpg", LEVELS, **values))
     np.testing.assert_allclose(picture.depth_lr[0], expected, rtol=1e-5)
-    assert np.abs(255 * picture.rgb.permute(1, 2, 0).numpy() - captures.photo().repeat(4, 0).repeat(4, 1)).mean() < 3
-    assert "relative" not in said(picture)
+    assert np.abs(255 * picture.rgb.permute(1, 2, 0).numpy() - captures.large_photo()).mean() < 3
+    assert relative in said(picture)
+    assert ("relative" in said(picture)) == bool(relative)
 
 
 def test_map_of_16_bits_of_an_extension_in_any_order_or_in_the_first_segment_is_read(tmp_path):
@@ -58,7 +61,7 @@ def test_map_of_16_bits_of_an_extension_in_any_order_or_in_the_first_segment_is_
 
 @pytest.mark.parametrize("options", [{"padding": 7}, {"progressive": True}])
 def test_files_behind_the_photo_are_found_by_its_end_and_their_lengths(tmp_path, options):
-    photo = encoded(255 - captures.photo().repeat(4, 0).repeat(4, 1), ".jpg")
+    photo = encoded_jpeg(255 - captures.large_photo())
     picture = only(captures.dynamic_depth(tmp_path / "photo.jpg", LEVELS, SURE, original=photo, **options))
     np.testing.assert_allclose(picture.depth_lr[0], INVERSE, rtol=1e-5)
     assert 255 * float(picture.rgb.mean()) == pytest.approx(255 - captures.photo().mean(), abs=2)
@@ -67,7 +70,7 @@ def test_files_behind_the_photo_are_found_by_its_end_and_their_lengths(tmp_path,
 def test_photo_before_effects_is_taken_if_it_has_the_size_of_the_photo(tmp_path):
     dark = np.zeros((*captures.HEIC, 3), np.uint8)
     for original, same in ((dark, True), (dark[::2, ::2], False)):
-        picture = only(captures.gdepth(tmp_path / "photo.jpg", LEVELS, original=encoded(original, ".jpg")))
+        picture = only(captures.gdepth(tmp_path / "photo.jpg", LEVELS, original=encoded_jpeg(original)))
         assert picture.rgb.shape[1:] == captures.HEIC
         assert (float(picture.rgb.max()) < 0.1) == same
 
@@ -76,7 +79,7 @@ def test_photo_before_effects_is_taken_if_it_has_the_size_of_the_photo(tmp_path)
 def test_depth_without_any_confidence_is_a_hole_and_confidence_is_read(tmp_path, write):
     confidence = SURE.copy()
     confidence[:8], confidence[8:16] = 0, 51
-    path = write(tmp_path / "photo.jpg", LEVELS, confidence=confidence)
+    path = write(tmp_path / "photo.jpg", LEVELS, confidence)
     picture = only(path)
     np.testing.assert_allclose(picture.confidence[0], confidence / 255, atol=1e-6)
     assert picture.depth_lr[0].isnan().sum(1).tolist() == [64] * 8 + [0] * 40
@@ -85,35 +88,24 @@ def test_depth_without_any_confidence_is_a_hole_and_confidence_is_read(tmp_path,
 
 @pytest.mark.parametrize("point", [(0.5, 0.5), (127.5, 95.5)])
 def test_camera_is_the_imaging_model_with_its_principal_point_in_shares_or_pixels(tmp_path, point):
-    camera = only(captures.dynamic_depth(tmp_path / "a.jpg", LEVELS, model=IMAGING_MODEL.format(*point))).camera
+    camera = only(captures.dynamic_depth(tmp_path / "a.jpg", LEVELS, model=imaging_model(*point))).camera
     assert (camera.width, camera.height, camera.fx, camera.fy) == (256, 192, 200, 201)
     assert (camera.cx, camera.cy) == (127.5, 95.5)
 
 
 def test_distances_along_the_rays_become_depth(tmp_path):
-    path = captures.dynamic_depth(
-        tmp_path / "a.jpg", LEVELS, model=IMAGING_MODEL.format(0.5, 0.5), MeasureType="OpticRay"
-    )
-    picture = only(path)
+    options = {"model": imaging_model(), "MeasureType": "OpticRay"}
+    picture = only(captures.dynamic_depth(tmp_path / "a.jpg", LEVELS, **options))
     y, x = np.mgrid[:48, :64]
     ray = np.sqrt(1 + ((x - 31.5) / 50) ** 2 + ((y - 23.5) / 50.25) ** 2)
     np.testing.assert_allclose(picture.depth_lr[0], INVERSE / ray, rtol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("units", "text"), [("", "may be relative, the file does not"), ("None", "is relative, as the")]
-)
-def test_depth_of_no_unit_is_said_to_be_relative(tmp_path, capsys, units, text):
-    path = captures.gdepth(tmp_path / "photo.jpg", LEVELS, Units=units)
-    assert upsample(path, "-o", tmp_path / "out", "--method", "bicubic", "--only", "depth") == 0
-    assert f"the depth {text}" in capsys.readouterr().out
 
 
 def test_photo_with_an_orientation_lies_as_stored_and_its_focal_length_is_that_of_exif(tmp_path):
     exif = captures.Image.Exif()
     exif[0x0112] = 6
     exif.get_ifd(0x8769)[0xA405] = 52
-    photo = encoded(captures.photo().repeat(4, 0).repeat(4, 1), ".jpg", exif=exif)
+    photo = encoded_jpeg(captures.large_photo(), exif=exif)
     picture = only(captures.gdepth(tmp_path / "photo.jpg", LEVELS, file=photo))
     assert picture.rgb.shape[1:] == captures.HEIC
     assert "orientation is ignored" in said(picture)
@@ -121,24 +113,18 @@ def test_photo_with_an_orientation_lies_as_stored_and_its_focal_length_is_that_o
 
 
 def test_photos_of_a_folder_are_read_unless_depth_maps_are_beside_them(tmp_path):
-    for name in ("b", "a"):
-        captures.gdepth(tmp_path / f"{name}.JPG", LEVELS)
-    plain = tmp_path / "plain.jpg"  # behind whose pixels is no XMP
-    plain.write_bytes(encoded(captures.photo(), ".jpg") + b"http://ns.google.com/photos/1.0/depthmap/")
-    assert [pair.name for pair in find_pairs_of_folder(tmp_path).pairs] == ["a", "b"]
+    for name in ("b.jpeg", "a.jpg", "a.JPG"):
+        captures.gdepth(tmp_path / name, LEVELS)
+    no_xmp = encoded_jpeg(captures.photo()) + b"http://ns.google.com/photos/1.0/depthmap/"
+    plain = written(tmp_path / "plain.jpg", no_xmp)
+    found = find_pairs_of_folder(tmp_path).pairs
+    assert [pair.rgb.name for pair in found] == ["a.JPG", "a.jpg", "b.jpeg"]
+    assert len({pair.name for pair in found}) == 3
     captures.save(tmp_path / "a_depth.png", captures.millimetres())
     (pair,) = find_pairs_of_folder(tmp_path).pairs
     assert (pair.capture, pair.depth.name) == (None, "a_depth.png")
     with pytest.raises(NoPairError, match=r"plain\.jpg: expected a folder or depth in a file as .*\.jpg.*; got none"):
         find_pairs_of_folder(plain)
-
-
-def test_photos_that_differ_in_their_suffix_alone_are_both_read(tmp_path):
-    for name in ("a.JPG", "a.jpg", "b.jpeg"):
-        captures.gdepth(tmp_path / name, LEVELS)
-    found = find_pairs_of_folder(tmp_path)
-    assert {pair.rgb.name for pair in found.pairs} == {"a.JPG", "a.jpg", "b.jpeg"}
-    assert len({pair.name for pair in found.pairs}) == 3
 
 
 def test_damaged_photo_of_a_folder_leaves_the_others(tmp_path, capsys):
@@ -151,8 +137,7 @@ def test_damaged_photo_of_a_folder_leaves_the_others(tmp_path, capsys):
 
 def changed(write, old, new, count=-1, **options):
     def damage(path):
-        write(path, LEVELS, **options)
-        content = path.read_bytes()
+        content = write(path, LEVELS, **options).read_bytes()
         assert old in content
         path.write_bytes(content.replace(old, new, count))
 
@@ -160,8 +145,8 @@ def changed(write, old, new, count=-1, **options):
 
 
 PICTURE, NUMBERS = "expected a grey JPEG or PNG", "Near, Far: expected positive numbers, got "
-MODEL = IMAGING_MODEL.format(0.5, 0.5)
-LARGE = encoded(np.random.default_rng(0).integers(0, 256, (200, 200, 3)).astype(np.uint8))
+MODEL = imaging_model()
+LARGE = encoded_png(np.random.default_rng(0).integers(0, 256, (200, 200, 3)).astype(np.uint8))
 DATA, BOMB = b'GDepth:Data="iVBO', b'<!DOCTYPE a [<!ENTITY b "&b;&b;">]><x:xmpmeta'
 REFUSED = {
     "no number": (changed(captures.gdepth, b'Near="0.5"', b'Near="x.5"'), f"{NUMBERS}'x.5', '4.0'"),
@@ -178,7 +163,7 @@ REFUSED = {
     "beyond the end": (changed(captures.dynamic_depth, b'Length="', b'Length="9'), PICTURE),
     "no item": (changed(captures.dynamic_depth, b'DepthURI="android/', b'DepthURI="andromeda/'), PICTURE),
     "model": (changed(captures.dynamic_depth, b'LengthX="200"', b'LengthX="nan"', model=MODEL), "ImagingModel"),
-    "size of confidence": (lambda path: captures.gdepth(path, LEVELS, confidence=SURE[1:]), "expected confidence"),
+    "size of confidence": (lambda path: captures.gdepth(path, LEVELS, SURE[1:]), "expected confidence"),
 }  # fmt: skip
 
 

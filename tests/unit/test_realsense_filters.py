@@ -50,7 +50,7 @@ def test_method_is_the_first_frames_result_by_the_baseline_of_the_camera_or_its_
     found = RealSense()(sample)
     assert bool(found.isfinite().all())
     if scale == 1:
-        expected = torch.from_numpy(results["filled"][0] * realsense_sdk.UNIT)
+        expected = _in_metres(results["filled"][0])
         torch.testing.assert_close(found[0][known], expected[known], rtol=0, atol=0.00051)
     holes = RealSense(fill_holes=False)(sample)[0, ::scale, ::scale].isnan()
     assert torch.equal(holes, torch.from_numpy(results["frames"][0] == 0))
