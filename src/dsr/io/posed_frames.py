@@ -75,10 +75,12 @@ class Frame:
             raise ValueError(f"{self.errors}: expected depth_error of the depth map's shape, got {values.shape}")
         return values.astype(np.float32)
 
-    def read_certain(self) -> np.ndarray:
-        """Return the depth without pixels that are expected to be off by more than ``max_error``."""
+    def read_certain(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the depth without pixels that are expected to be off by more than ``max_error``, and these errors."""
         depth, errors = self.read_depth(), self.read_errors()
-        return depth if errors is None else np.where(errors <= self.max_error * depth, depth, np.float32(np.nan))
+        if errors is None:
+            return depth, np.full(depth.shape, np.nan)
+        return np.where(errors <= self.max_error * depth, depth, np.float32(np.nan)), errors
 
     def read_colour(self) -> np.ndarray:
         """Return the photo, (H, W, 3) uint8, red first."""
@@ -109,7 +111,7 @@ def sample_points(frames: Sequence[Frame]) -> tuple[Points, Observed]:
     agreeing, contradicting = np.zeros((2, len(points.places)), int)
     observed: Observed = []
     for frame in frames:
-        depth = frame.read_certain()
+        depth, _ = frame.read_certain()
         found, pixels, z = visible(points.places, frame.camera, frame.matrix)
         columns, rows = np.rint(pixels).astype(np.intp).T
         limit, nearest = frame.max_error * z, cv2.erode(np.nan_to_num(depth), np.ones((3, 3)))  # 0 beside holes
@@ -124,7 +126,7 @@ def sample_points(frames: Sequence[Frame]) -> tuple[Points, Observed]:
 
 
 def _sample(frame: Frame, count: int) -> Points:
-    camera, depth, pose = frame.camera, frame.read_certain(), frame.matrix
+    camera, pose, (depth, errors) = frame.camera, frame.matrix, frame.read_certain()
     step = max(1, int(np.ceil(np.sqrt(depth.size * count / _MOST))))
     at = np.s_[::step, ::step]
     known = np.isfinite(depth[at])
@@ -140,7 +142,6 @@ def _sample(frame: Frame, count: int) -> Points:
     axes[:, :, 2] *= -np.sign((axes[:, :, 2] * rays).sum(1))[:, None]
     axes[:, :, 0] = np.cross(axes[:, :, 1], axes[:, :, 2])
     sizes[:, 0] = np.minimum(sizes[:, 0], _LONGEST * sizes[:, 1])
-    errors = np.full(depth.shape, np.nan) if (stated := frame.read_errors()) is None else stated
     places = (rays * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
     return Points(places, frame.read_colour()[at][known], pose[:3, :3] @ axes, sizes, errors[at][known])
 

@@ -65,19 +65,19 @@ def expect_poses(part: str, known: Mapping[str, bool]) -> None:
 
 
 def _write_pictures(
-    folder: Path, kinds: tuple[str, str], frame: Frame, values: np.ndarray, *, masked: bool = False
+    folder: Path, kinds: tuple[str, str], frame: Frame, values: np.ndarray, known: np.ndarray | None = None
 ) -> list[Path]:
     """Write the photo and values of the depth, (H, W) uint16, of a frame into two folders, and return the files.
 
-    ``masked``: write a mask into ``masks/``, too, 255 where there is depth and 0 in holes.
+    ``known``, (H, W) bool, the pixels with depth, makes a mask in ``masks/``, too, 255 there and 0 in holes.
     """
     photo, depth, mask = (folder / kind / f"{frame.stem}.png" for kind in (*kinds, "masks"))
     with replacing(photo) as temporary:
         shutil.copyfile(frame.colour, temporary)
     write_png(depth, values)
-    if not masked:
+    if known is None:
         return [photo, depth]
-    write_png(mask, np.where(np.isnan(frame.read_depth()), 0, 255).astype(np.uint8))
+    write_png(mask, np.where(known, 255, 0).astype(np.uint8))
     return [photo, depth, mask]
 
 
@@ -148,7 +148,8 @@ def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
     masked, files, entries = _have_holes(frames), list[Path](), list[dict[str, Any]]()
     for frame in frames:
         depth, keys = frame.read_depth(), ("file_path", "depth_file_path", "mask_path")
-        own = _write_pictures(folder, ("images", "depths"), frame, to_millimetres(depth)[0], masked=masked)
+        known = ~np.isnan(depth) if masked else None
+        own = _write_pictures(folder, ("images", "depths"), frame, to_millimetres(depth)[0], known)
         normals = path.parent / NORMALS / own[0].name
         write_normals(normals, torch.from_numpy(depth)[None], frame.camera)
         named = {**dict(zip(keys, own, strict=False)), "normal_file_path": normals}
@@ -199,9 +200,10 @@ def write_splatting(folder: Path, frames: Sequence[Frame]) -> list[Path]:
     scale = 65536 / _STEPS / nearest
     masked, files = _have_holes(frames), list[Path]()
     for frame in frames:
-        inverse = np.rint(65536 / (scale * frame.read_depth().astype(np.float64)))
+        depth = frame.read_depth()
+        inverse = np.rint(65536 / (scale * depth.astype(np.float64)))
         values = np.nan_to_num(inverse, nan=0, posinf=0).astype(np.uint16)
-        files += _write_pictures(folder, ("images", "depths"), frame, values, masked=masked)
+        files += _write_pictures(folder, ("images", "depths"), frame, values, ~np.isnan(depth) if masked else None)
     parameters = {frame.stem: {"scale": scale, "offset": 0.0} for frame in frames}
     (points, observed), sparse = sample_points(frames), folder / "sparse" / "0"
     contents = {
