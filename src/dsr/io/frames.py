@@ -5,6 +5,7 @@ opened is stated in its :class:`Geometry`; what is in a file of each frame is re
 """
 
 import hashlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,15 +30,15 @@ _Arguments = ParamSpec("_Arguments")
 
 
 @dataclass(frozen=True)
-class Source:
+class Source(ABC):
     """A photo or a map inside a file, such as a frame of a video; other processes get it pickled and read it anew."""
 
     file: Path
     name: str  # within the file
 
+    @abstractmethod
     def read(self) -> np.ndarray:
         """Return the pixels: (H, W, 3) uint8 RGB of a photo, (h, w) stored values of a map."""
-        raise NotImplementedError
 
     def record(self) -> Record:
         """Return what identifies the content: where it is, and a hash of the file."""
