@@ -81,12 +81,7 @@ DETECTED = ((find_frames, load_frame, "sunrgbd"),)
 
 
 class SunRGBD(PreparedDataset):
-    """Scenes of SUN RGB-D; the true depth is what the sensor measured, with its holes, or the authors' refined one.
-
-    Args:
-        frames: the folder that each name stands for; where several scenes lie below one, its first. None: all folders.
-
-    """
+    """Scenes of SUN RGB-D; the true depth is what the sensor measured, with its holes, or the authors' refined one."""
 
     def __init__(
         self,

@@ -40,15 +40,7 @@ _WINDOW = 9  # low-resolution pixels of the window in which the noise is measure
 
 @dataclass(frozen=True)
 class Downsampling:
-    """A downsampling model.
-
-    Args:
-        kernel: name of the kernel, see the module.
-        sigma: standard deviation of the gaussian as a fraction of the scale factor.
-        range_type: range type that is averaged; None for the one that the method works on, as in the paper.
-        assumed: kernel of the forward model that methods assume (DIP); None for the true one.
-
-    """
+    """A downsampling model."""
 
     kernel: Kernel
     sigma: float = 0.5
@@ -136,12 +128,7 @@ def cubic_kernel(x: Tensor, a: float = -0.5) -> Tensor:
 
 @dataclass(frozen=True)
 class Measured:
-    """In place of a downsampling model: the scene's own low-resolution map, measured by a sensor.
-
-    Args:
-        assumed: kernel of the forward model that methods assume for the sensor (DIP).
-
-    """
+    """In place of a downsampling model: the scene's own low-resolution map, measured by a sensor."""
 
     assumed: Kernel = "box"
 

@@ -20,13 +20,7 @@ Holes = Callable[[Tensor, Camera, torch.Generator], Tensor]
 
 @dataclass(frozen=True)
 class Blobs:
-    """Blobs of random shape and position: the highest values of smoothed noise.
-
-    Args:
-        share: fraction of the pixels.
-        size: typical diameter in low-resolution pixels.
-
-    """
+    """Blobs of random shape and position: the highest values of smoothed noise."""
 
     share: float = 0.1
     size: float = 12.0
@@ -54,12 +48,7 @@ class Blobs:
 
 @dataclass(frozen=True)
 class Shadows:
-    """Strips beside depth steps, hidden from a second camera or projector ``baseline`` metres beside the first.
-
-    Args:
-        baseline: in metres; positive if the second is to the right, so that holes lie to the left of near objects.
-
-    """
+    """Strips beside depth steps, hidden from a second camera or projector ``baseline`` metres right of the first."""
 
     baseline: float = 0.2
 

@@ -36,12 +36,7 @@ class Noise(Protocol):
 
 @dataclass(frozen=True)
 class GaussianMultiplicative:
-    """Multiplicative noise: values times 1 + std N(0, 1), in the range type that is averaged (Voynov et al. 2019).
-
-    Args:
-        std: standard deviation of the factor.
-
-    """
+    """Multiplicative noise: values times 1 + std N(0, 1), in the range type that is averaged (Voynov et al. 2019)."""
 
     range_type: ClassVar[RangeType | None] = None
     std: float
@@ -67,12 +62,6 @@ class TimeOfFlight:
     which to first order makes the depth's standard deviation strength z^3 / stereo_constant^2 for ``doffs`` = 0: 1.8 mm
     at 1 m, 116 mm at 4 m. It suits rooms: from about 10 m on, the tail of the distribution reaches infinity. Their v
     lacks the shift of Middlebury's views of 2005 (``dmin.txt``), which ``doffs`` takes.
-
-    Args:
-        strength: the product of v and its standard deviation, in square pixels.
-        stereo_constant: baseline times focal length in metre pixels; 0.16 m x 3740 px for Middlebury 2005 and 2006.
-        doffs: offset that the map's disparities lack, in pixels.
-
     """
 
     range_type: ClassVar[RangeType | None] = "orthogonal"
@@ -100,16 +89,6 @@ class Kinect:
     and Resolution of Kinect Depth Data*, Sensors 2012), so depth comes in steps of step z^2 / stereo_constant. With the
     defaults, noise and rounding together have their random error, 1.42e-3 z^2 m. The noise of neighbouring pixels is
     independent here; that of a sensor, which matches windows, is not.
-
-    Args:
-        std: standard deviation of the disparity noise, in the sensor's pixels, whatever the camera of the map.
-        step: quantisation step of disparity, in the sensor's pixels.
-        stereo_constant: baseline times focal length of the sensor in metre pixels; 0.075 m x 580 px for a Kinect.
-        dropout: probability that a pixel beside a depth edge is a hole.
-        jump: relative difference of two neighbours' depths beyond which an edge lies between them.
-        reach: width of the band of dropouts on each side of an edge, in low-resolution pixels.
-        nearest, farthest: range of valid readings in metres; None for no limit.
-
     """
 
     range_type: ClassVar[RangeType | None] = "orthogonal"

@@ -40,26 +40,7 @@ GRAIN = (-4.6, -3)  # range of the decadic logarithm of the grain's height over 
 
 @dataclass(frozen=True)
 class Everything:
-    """The distribution of random degradations.
-
-    Args:
-        scales: relative frequency of each factor; None for the run's factor.
-        kernels: relative frequency of each kernel.
-        noises: relative frequency of each kind of noise.
-        holes: relative frequency of each kind of holes.
-        folds: fraction of the truths with folds and dents of 2 to 24 pixels in places, which the photo shades.
-        relief: fraction of the truths with fine relief, or the steps of a file's levels; none at factor 1, where it
-            could not be distinguished from noise.
-        displaced: fraction of the noisy maps that are displaced against the photo, by up to one low-resolution pixel.
-        rounded: fraction of the maps that are rounded to levels.
-        soft: fraction of the patches whose truth has soft depth steps: blurred, large scenes also at half their size.
-        photo: fraction of the photos with another exposure, colours, blur, noise and compression; half for clean maps.
-        textured: fraction of the photos on which a pattern is printed, which is no relief.
-        clear: fraction of the maps with one of ``SENSOR_NOISES`` in which clear, mirroring or glossy objects stand. The
-            truth is their surface, the map what a sensor sees. None if depth steps are soft, as their edges are not.
-        told: fraction of the maps whose kernel is stated by a hint; likewise, independently, for noise and steps.
-
-    """
+    """The distribution of random degradations."""
 
     scales: Mapping[Any, float] | None = None
     kernels: Mapping[str, float] = field(

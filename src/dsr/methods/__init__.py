@@ -1,1 +1,1 @@
-"""Super-resolution methods, one module each."""
+"""Super-resolution methods, one module each; ``conf/method`` and ``conf/model`` describe their options."""

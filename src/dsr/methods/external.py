@@ -40,24 +40,7 @@ _MOST_OFF = 3.0  # factor between the medians from which on the unit is another 
 
 
 class External(Method):
-    """A method that reads its results from files.
-
-    Args:
-        path: directory of the predictions; its name is the method's in scores and tables.
-        file: name of a scene's file, with or without a suffix; ``{scene}``, ``{dataset}`` and ``{scale}`` stand for the
-            sample's. Without a suffix, it is any of the formats of :data:`dsr.io.depth_files.DEPTH_SUFFIXES`.
-        range_type: what the values measure; ``disparity`` in pixels of the photo's camera.
-        unit: m, cm, mm or metres per value (of disparities and inverse depths: pixels or 1/m per value). None for 1 of
-            floats; whole numbers need one.
-        hole_value: a value that marks a hole, beside those of :func:`dsr.io.depth_files.find_holes`.
-        fit: to the low-resolution map, in the values' quantity: ``scale``, ``affine`` (scale and shift), None for maps
-            that are metric.
-        resize: how a map of another size is brought to the photo's; None to refuse it.
-        check: whether maps are refused that cannot be of the scene, or in the unit: of another median, or unlike the
-            low-resolution map.
-        alignment: of the predictions to the truths, see :mod:`dsr.metrics.alignment`; with one, any median is taken.
-
-    """
+    """A method that reads its results from files, of any median if they are aligned to the truths (``alignment``)."""
 
     abilities = Abilities(ratios="any", own_size=True, cost=Cost(60))
     range_type = "orthogonal"

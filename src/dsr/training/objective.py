@@ -75,13 +75,6 @@ class DepthObjective(Objective):
     """The loss: depth_loss + w visual (Voynov et al. 2019, eq. 4: Lap_1 + w MSE_v), and perhaps a shading loss.
 
     The depth loss compares disparities divided by the range of the low-resolution ones.
-
-    Args:
-        depth_loss: ``lap1``, ``l1`` or ``mse``.
-        w: weight of the visual loss; 0 for none; ``auto`` is computed by :meth:`balanced`, and 1 before.
-        visual: the visual loss.
-        shading: weight of :func:`shading_loss`; 0 for none.
-
     """
 
     depth_loss: DepthLoss = "lap1"

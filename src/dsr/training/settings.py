@@ -13,23 +13,7 @@ _BYTES, _BYTES_OF_WORKER = 256, 1 << 26  # least memory of a pixel with a layer 
 
 @dataclass(frozen=True)
 class PatchSettings:
-    """How patches are cropped and augmented.
-
-    Args:
-        patch: height and width in pixels, a multiple of the scale.
-        batch: number of patches per step and device.
-        validation_scenes: number of scenes at the end of each data set that are kept for validation.
-        scenes: number of scenes to use of each data set, from its first on; None for all.
-        workers: number of additional processes that crop patches; ``auto`` for none on a CPU, and beside a GPU for one
-            less than there are cores.
-        on_device: whether a GPU makes the patches; ``auto``: where it can, as ``conf/trainer/default.yaml`` says.
-        flip: whether scenes are mirrored at random, horizontally and vertically.
-        rotate: whether scenes are rotated by random quarter turns, the camera included.
-        depth_scale: s, where depth is multiplied by exp(U(-s, s)).
-        colour: standard deviation of the gain of each colour channel.
-        photo: fraction of the patches whose rgb gets another gamma, exp(U(-0.5, 0.5)), blur, and noise of up to 0.03.
-
-    """
+    """How patches are cropped and augmented; ``conf/trainer/default.yaml`` describes the settings."""
 
     patch: int = 96
     batch: int = 6

@@ -58,14 +58,6 @@ class Bilateral(MapFilter):
     """The bilateral filter of the low-resolution depth, and its interpolation where the scale is above 1.
 
     The defaults suit depth cameras at 0.5 to 2 m; noise grows with distance.
-
-    Args:
-        window: diameter of the window in low-resolution pixels.
-        sigma_depth: standard deviation of the Gaussian of depth differences, in metres.
-        sigma_space: standard deviation of the Gaussian of distances, in low-resolution pixels.
-        fill_holes: whether holes are inpainted; otherwise a high-resolution pixel whose nearest low-resolution pixel is
-            a hole is a hole.
-
     """
 
     range_type = "orthogonal"
@@ -94,16 +86,7 @@ def filter_bilateral(depth: Tensor, window: int, sigma_depth: float, sigma_space
 
 @dataclass(eq=False)
 class JointBilateral(GuidedMethod):
-    """Joint bilateral upsampling of the low-resolution disparity.
-
-    Args:
-        radius: radius of the neighbourhood in low-resolution pixels.
-        sigma_space: standard deviation of the distance's Gaussian, in low-resolution pixels.
-        sigma_colour: standard deviation of the Gaussian of the Euclidean colour difference, colours in [0, 1].
-        fill_holes, slopes: see :class:`dsr.methods.classical.guided_filter.GuidedMethod`; a hole is filled by this
-            filter within the radius, and inpainted beyond it.
-
-    """
+    """Joint bilateral upsampling of the low-resolution disparity; holes beyond its radius can only be inpainted."""
 
     abilities = replace(GuidedMethod.abilities, fast_on="cpu")
 

@@ -159,17 +159,6 @@ def _take_sides(reachable: Tensor, barrier: Tensor, hr: Tensor, scale: int) -> N
 class EdgeGuided(Method):
     """Edge-guided upsampling of the low-resolution disparity.
 
-    Args:
-        step: minimum step of disparity at an edge, as a fraction of the map's range.
-        candidates: number of candidates for each patch of edges.
-        sharp_weight: weight of the edges relative to that of their distance transform, in the similarity of patches.
-        smoothness: weight of the disagreement of overlapping patches.
-        iterations: maximum number of iterations of belief propagation in each stage.
-        radius: radius of the filter's neighbourhood in low-resolution pixels of the stage.
-        sigma_space: standard deviation of the distance's Gaussian, in low-resolution pixels of the stage.
-        mixed: weight of a low-resolution pixel with an edge through it, relative to others.
-        fill_holes: whether holes of the low-resolution map are inpainted; otherwise they stay.
-
     Attributes:
         history: of the last call: iterations (over all stages), energy of the labels, largest change of a message.
 

@@ -26,15 +26,7 @@ _HALF = 0.5 + 1e-6  # maximum distance, in high-resolution pixels, of data from 
 
 @dataclass(eq=False)
 class FastGlobalSmoother(GuidedMethod):
-    """The fast global smoother of the low-resolution disparity, as sparse data.
-
-    Args:
-        smoothness: lambda, in squared low-resolution pixels; well below 1 the rows without data show as stripes.
-        sigma_colour: Euclidean colour difference, colours in [0, 1], at which a neighbour's weight is 1 / e.
-        iterations: number of pairs of passes.
-        fill_holes, slopes: see :class:`dsr.methods.classical.guided_filter.GuidedMethod`.
-
-    """
+    """The fast global smoother of the low-resolution disparity, as sparse data."""
 
     smoothness: float = 1.0
     sigma_colour: float = 0.03

@@ -120,14 +120,7 @@ class GuidedMethod(Method):
 
 @dataclass(eq=False)
 class GuidedFilter(GuidedMethod):
-    """The guided filter of the interpolated low-resolution disparity.
-
-    Args:
-        radius: radius of the windows in low-resolution pixels.
-        epsilon: regularisation added to the variances of colours in [0, 1]; smaller variances have no effect.
-        fill_holes, slopes: see :class:`GuidedMethod`.
-
-    """
+    """The guided filter of the interpolated low-resolution disparity."""
 
     radius: float = 0.5
     epsilon: float = 1e-3

@@ -30,13 +30,8 @@ class Interpolation(Method):
 
     ``bicubic`` is the interpolating cubic spline; ``clough_tocher`` is the smooth piecewise cubic surface over
     triangles, which gives the scores of the "Bicubic" of Voynov et al. 2019. Both repeat the outermost pixels beyond
-    the border. Pixels are matched through the cameras.
-
-    Args:
-        order: ``nearest``, ``bilinear``, ``bicubic`` or ``clough_tocher``.
-        fill_holes: whether holes of the low-resolution map take the value of the nearest valid pixel; otherwise a
-            high-resolution pixel whose nearest low-resolution pixel is a hole is a hole.
-
+    the border. Pixels are matched through the cameras. Unless holes are filled, a high-resolution pixel whose nearest
+    low-resolution pixel is a hole is one, too.
     """
 
     abilities = Abilities(ratios="any", own_size=True, cost=Cost(100))

@@ -28,16 +28,7 @@ _CREDIBLE, _RECENT = 2, 4  # frames with depth, of how many, after which a hole 
 
 @dataclass(eq=False)
 class RealSense(MapFilter):
-    """RealSense's filters of the low-resolution depth, and its interpolation where the scale is above 1.
-
-    Args:
-        alpha: weight of a pixel against the mean of those before it, 0 to 1.
-        delta: difference of neighbours at which the mean begins anew, in 1/32 pixel of disparity.
-        iterations: how often the spatial filter runs.
-        baseline: distance of the stereo camera's sensors in metres, if the map's camera has none; D435: 0.05.
-        fill_holes: whether holes are filled as the SDK does, and those that it leaves at the border inpainted.
-
-    """
+    """RealSense's filters of the low-resolution depth, and its interpolation where the scale is above 1."""
 
     alpha: float = 0.5
     delta: float = 20.0

@@ -307,17 +307,6 @@ class ShapeFromShading(Method):
 
     Holes of the input are inpainted. The low-resolution map is assumed to hold block means of depth.
 
-    Args:
-        iterations: maximum number of iterations.
-        tolerance: relative change of the energy in an iteration, and RMS difference of theta and the slopes, below
-            which it stops.
-        data_weight: weight of the low-resolution map (mu).
-        area_weight: weight of the surface's area (nu).
-        boundary_weight: weight of the albedo's boundaries (lambda).
-        penalty: initial penalty of the difference of theta and the slopes (kappa).
-        growth: factor of the penalty in each iteration.
-        foreground: folder of masks SCENE.png of the image's size, white at the object; None for the whole image.
-
     Attributes:
         history: of the last call: the ``objective``, its terms, the ``residual``, which is the RMS difference of theta
             and the slopes, and the RMS movement of z relative to the median depth, ``moved``.

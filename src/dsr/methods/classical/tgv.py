@@ -72,18 +72,6 @@ class TotalGeneralisedVariation(Method):
     """TGV-guided upsampling.
 
     Holes of the input are inpainted. The low-resolution map is assumed to hold block means of disparity.
-
-    Args:
-        iterations: maximum number of iterations.
-        tolerance: RMS movement within 50 iterations, relative to the map's range, below which it stops.
-        first: weight alpha_1 of the distance between the map's gradient and v.
-        second: weight alpha_0 of the variation of v.
-        data_weight: weight of the input (lambda); None for block means that equal the input exactly; ``auto`` for a
-            weight that suits the noise of the input, estimated from it alone, see :meth:`choose_weight`.
-        sharpness: strength of the image's edges, across which the map may jump (beta).
-        exponent: exponent of the image's gradient (gamma).
-        step_ratio: ratio of dual to primal step sizes; changes the speed of convergence, not the minimum.
-
     """
 
     abilities = Abilities(ratios="whole", cost=Cost(800, 60))

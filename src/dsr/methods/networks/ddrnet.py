@@ -25,14 +25,7 @@ _UPSAMPLING = 4  # receptive-field radius of the upsampling in low-resolution pi
 
 
 class DDRNet(NormalisedNetwork):
-    """The network.
-
-    Args:
-        scale: upsampling factor, 2, 4, 8 or 16.
-        denoising: channels of the first layer of the denoising network.
-        refinement: channels of the first layers of the refinement network, a multiple of 4.
-
-    """
+    """The network."""
 
     def __init__(self, scale: int, denoising: int = 32, refinement: int = 16) -> None:
         super().__init__()

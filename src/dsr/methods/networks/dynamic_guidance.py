@@ -104,15 +104,7 @@ class Stage(nn.Module):
 
 
 class DynamicGuidance(NormalisedNetwork):
-    """The network, which computes in float32, or in float64 where the weights are.
-
-    Args:
-        scale: upsampling factor, 2, 4, 8 or 16.
-        stages: number of unrolled steps.
-        filters: number of filters of each step, at most size^2 - 3.
-        size: size of a filter in pixels, at least 3.
-
-    """
+    """The network, which computes in float32, or in float64 where the weights are."""
 
     def __init__(self, scale: int, stages: int = 5, filters: int = 24, size: int = 7) -> None:
         super().__init__()

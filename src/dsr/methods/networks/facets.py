@@ -31,17 +31,7 @@ _WIDENED = ("photo.weight", "coarse.weight")  # may have more inputs, after thos
 
 
 class Facets(NormalisedNetwork):
-    """The network.
-
-    Args:
-        scale: upsampling factor, 2, 4, 8 or 16.
-        width: channels at the low resolution.
-        blocks: residual blocks there.
-        facets: number of planes that each low-resolution pixel proposes.
-        slopes: whether planes have slopes; if not, each is a constant, and the network predicts an interpolation kernel
-            for each pixel (an ablation).
-
-    """
+    """The network."""
 
     def __init__(self, scale: int, width: int = 96, blocks: int = 6, facets: int = 2, *, slopes: bool = True) -> None:
         super().__init__()

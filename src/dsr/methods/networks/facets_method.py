@@ -48,19 +48,6 @@ class AnyMap(Method):
 
     Maps known to be without noise, and either box means with sharp depth steps or bicubic with soft ones, are computed
     with weights of their own, if the file of weights names a file with such weights.
-
-    Args:
-        weights: file that ``train.py model=facets`` wrote, or a network, which is used as it is.
-        noise: standard deviation of the map's depth in metres, at 1 m if it grows; None if it is not known.
-        noise_growth: the noise grows with this power of the distance: 0 where it is the same everywhere, 2 for stereo.
-        smooth: the map's noise, given or estimated, is multiplied by this, 0 to 2.
-        edges: whether the result's depth steps are to be ``sharp`` or ``soft``, a pixel's value then being a mean over
-            its area; ``auto``: as the map shows.
-        kernel: of the downsampling that made the map, if it is known.
-        clean: whether the map is known to have no noise, unless ``noise`` or ``smooth`` say otherwise.
-        max_error: share of the depth; pixels that are expected to be further off are left as holes; None for no limit.
-        model: name of the model that the file must contain.
-
     """
 
     abilities = Abilities(

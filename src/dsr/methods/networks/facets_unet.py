@@ -60,16 +60,7 @@ _MARGIN = 4  # low-resolution rows beyond a band that its result depends on
 
 
 class FacetsUNet(DisparityNetwork):
-    """The network.
-
-    Args:
-        scale: upsampling factor, 1, 2, 4, 8 or 16; 1 and 2 have the same weights.
-        width: channels of the trunk at the low resolution.
-        deep: channels of its coarser levels.
-        blocks: residual blocks at the low resolution, of two sets of weights each.
-        facets: number of planes that each low-resolution pixel proposes.
-
-    """
+    """The network; its weights at the factors 1 and 2 are the same."""
 
     of_inverse_depth = True
     states_errors = True

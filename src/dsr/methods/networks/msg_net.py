@@ -110,10 +110,6 @@ def intensity_of(rgb: Tensor, variant: VariantName) -> Tensor:
 class MSGNet(DisparityNetwork):
     """The network of all variants; modules are registered in the order in which data passes them.
 
-    Args:
-        scale: upsampling factor, 2, 4, 8 or 16; log2(scale) levels.
-        variant: ``hui``, ``voynov`` or ``dsr``.
-
     Example:
         >>> import torch
         >>> from dsr.methods.networks.msg_net import MSGNet

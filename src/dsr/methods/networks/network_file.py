@@ -52,26 +52,7 @@ _TOLERANCE = 1e-4  # largest difference between the graph's and the network's re
 
 
 class NetworkFile(Method):
-    """A method that is a network's file.
-
-    Args:
-        path: ``.onnx``, which needs ``pip install -e '.[onnx]'``.
-        inputs: what each input gets, by its name, (1, C, H, W) float32: ``image``, the photo in 0..1; ``image255``;
-            ``imagenet``, normalised as for ImageNet; ``grey``, its luma; ``lr``, the low-resolution map; ``up``, that
-            map enlarged by Keys' cubic kernel to the photo's size; ``valid``, where the map is known (bool).
-        range_type: what the depth inputs measure, and the type that the low-resolution map is averaged in;
-            ``disparity`` in pixels of the photo's camera, ``inverse`` in 1/m, which is averaged as disparity.
-        range: what becomes 0..1 in the depth inputs: ``measured`` for the low-resolution map's minimum and maximum, two
-            numbers in the quantity's unit, or None for values as they are.
-        output: what the network returns, (1, 1, H, W): ``same`` as its depth inputs, in the same range; ``residual``,
-            to be added to the enlarged map; or a quantity as it is, of :data:`dsr.methods.external.QUANTITIES`.
-        fit: of the result to the low-resolution map, as of :class:`~dsr.methods.external.External`.
-        result: name of the output; None for the first.
-        size: height and width that photos are resized to by Keys' cubic kernel, and the result bilinearly back, for a
-            network that sees the photo alone; None for the photo's.
-        multiple: the number that has to divide the height and width; the photo is continued at the right and bottom.
-
-    """
+    """A method that is a network's file; docs/evaluate.md explains its options."""
 
     abilities = Abilities(ratios="any", own_size=True, cost=Cost(1000))
 

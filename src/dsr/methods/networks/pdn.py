@@ -156,16 +156,7 @@ class UnrolledHuber(nn.Module):
 
 
 class PrimalDualNetwork(NormalisedNetwork):
-    """The network.
-
-    Args:
-        scale: upsampling factor, 2, 4, 8 or 16.
-        width: number of channels of the convolutions.
-        layers: number of 3 x 3 convolutions.
-        window: size in pixels of the window that a pixel is compared within, odd.
-        iterations: number of unrolled iterations.
-
-    """
+    """The network."""
 
     def __init__(self, scale: int, width: int = 64, layers: int = 10, window: int = 5, iterations: int = 10) -> None:
         super().__init__()

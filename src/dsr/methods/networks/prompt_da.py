@@ -48,15 +48,8 @@ class PromptDA(Method):
     """A method that is Prompt Depth Anything.
 
     Holes of the low-resolution map are filled before, so that the range that the network normalises by is that of
-    depths. Large photos are resized, which limits the memory and what is seen of them.
-
-    Args:
-        weights: a folder with ``config.json`` and ``model.safetensors``, as ``save_pretrained`` writes it, or a name of
-            the Hugging Face hub, such as ``depth-anything/prompt-depth-anything-vits-hf``, whose files are taken from
-            its cache, or else fetched. Nothing but these two files is read, and no code in them is executed.
-        size: to which that side of the photo is brought, at its aspect, that has to be changed less; both sides are
-            rounded to multiples of the backbone's patches.
-
+    depths. Large photos are resized, which limits the memory and what is seen of them. Nothing but ``config.json`` and
+    ``model.safetensors`` of the weights' folder is read, and no code in them is executed.
     """
 
     abilities = Abilities(ratios="any", own_size=True, cost=Cost(60, program=5e9))

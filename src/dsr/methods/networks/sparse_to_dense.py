@@ -24,13 +24,7 @@ _STAGES = 4
 
 
 class SparseToDense(NormalisedNetwork):
-    """The network, which processes an image as a whole: the receptive field is wider than most images.
-
-    Args:
-        scale: upsampling factor, 2, 4, 8 or 16.
-        width: channels of the first residual blocks, a multiple of 4; the original has 64.
-
-    """
+    """The network, which processes an image as a whole: the receptive field is wider than most images."""
 
     def __init__(self, scale: int, width: int = 32) -> None:
         super().__init__()

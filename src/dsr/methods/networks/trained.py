@@ -35,18 +35,7 @@ _PARTS = ("conv.weight", "conv.bias", "activation.weight")
 
 
 class TrainedNetwork(NetworkUpsampler):
-    """A method from a file of weights.
-
-    Args:
-        weights: file that ``train.py`` wrote; or, with a ``variant``, one that the authors of MSG-Net published.
-        scale: upsampling factor of the run.
-        model: name of the model that dsr files must contain.
-        variant: variant of MSG-Net that published files must contain.
-        ensemble: number of test-time augmentations, see :class:`~dsr.methods.networks.network.NetworkUpsampler`; None
-            for 4 with dsr files and 1 with published ones.
-        networks: network classes by their :func:`~dsr.methods.networks.weight_files.network_name` in dsr files.
-
-    """
+    """A method from a file of weights: of ``train.py``, or, with a ``variant``, of the authors of MSG-Net."""
 
     def __init__(
         self,

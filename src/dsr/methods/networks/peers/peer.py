@@ -43,21 +43,8 @@ class Peer(Method):
     """A method that is a published network; it takes maps of any ratio, as the network works at the photo's size.
 
     At a whole factor that the network was trained for, the file must be for that factor; at another one, any may be
-    taken.
-
-    Args:
-        peer: name of the network, a key of ``PEERS``; or a network, which is copied, in place of a file.
-        weights: the file of a named network.
-        scale: the upsampling factor of the run.
-        weights_files: the trained factors of the authors' files by their names.
-        range_type: the range type of the map that the network gets.
-        range: the minimum and maximum that map to 0 and 1: ``measured`` for those of the low-resolution map, ``truth``
-            for those of the true one, which is how the authors get their figures. It is the one case besides the oracle
-            of deep image priors in which a method reads ``sample.depth``; ``flag`` marks its scores. Weights with a
-            ``depth_range`` of their own get orthogonal depth, normalised by it.
-        precision: dtype of the convolutions.
-        tile: as of :class:`~dsr.methods.networks.network.NetworkUpsampler`.
-
+    taken. Weights with a ``depth_range`` of their own get orthogonal depth, normalised by it. With ``range=truth``,
+    which is how the authors get their figures, it reads ``sample.depth``, and ``flag`` marks its scores.
     """
 
     abilities = Abilities(ratios="any", needs="weights")
