@@ -376,7 +376,6 @@ def _in_worker(
 
 
 def _seed(seed: int) -> None:
-    """Seed every global generator; dsr itself uses explicit ones."""
     random.seed(seed)
     np.random.seed(seed % 2**32)  # noqa: NPY002 - the legacy generator, for libraries that use it
     torch.manual_seed(seed)

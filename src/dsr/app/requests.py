@@ -165,7 +165,6 @@ class ExportRequest(Options):
     )
 
     def __post_init__(self) -> None:
-        """Check the values, and that there is such a method."""
         super().__post_init__()
         check_method(self.method, self.directories)
 

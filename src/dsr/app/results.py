@@ -73,7 +73,6 @@ def view(request: ViewRequest, console: Console) -> list[str]:
 
 
 def _pack(request: ViewRequest, folders: Sequence[Path], console: Console) -> tuple[list[Packed], list[str]]:
-    """Return the packed results, and what is wrong with the others."""
     each = min(request.vertices, _WHOLE_PAGE * request.vertices // len(folders))
     photo_side = _PHOTO if len(folders) <= _FEW else _SMALL_PHOTO
     packed: list[Packed] = []

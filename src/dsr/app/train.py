@@ -362,7 +362,6 @@ def _network(settings: TrainConfig) -> DisparityNetwork:
 
 
 def _module(settings: TrainConfig, net: DisparityNetwork, data: PatchData) -> SuperResolution:
-    """Build the training module, and its optimiser once, for its errors."""
     node, names = settings.model, settings.names
     w, loss = node["objective"].get("w"), settings.loss
     for key, unused in (("visual", not w and loss.visual != "mse_v"), ("w", loss.w not in ("auto", w))):

@@ -154,7 +154,6 @@ def _read_depth(
 
 
 def _range_type(path: Path, quantity: str, description: CameraFile) -> RangeType:
-    """Return the range type of a map, from its name and the camera file."""
     if quantity == "disparity":
         if description.range_type not in (None, "disparity"):
             raise ValueError(f"{path}: camera.json's range_type is {description.range_type!r}, expected 'disparity'")

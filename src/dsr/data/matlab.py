@@ -75,7 +75,6 @@ def expect_own_values(array: h5py.Dataset) -> None:
 
 
 def _old_variable(content: memoryview, order: str) -> tuple[str, Any]:
-    """Return the name and the value of a variable of version 5."""
     if not content:
         return "", None
     (_, flags), (_, sizes), (_, name), *parts = _elements(content, order)

@@ -159,7 +159,6 @@ def _number(path: Path, key: str, text: str) -> float:
 
 
 def _depth(path: Path, disparity: np.ndarray, camera: Camera) -> Tensor:
-    """Return the depth of a disparity map, (1, H, W)."""
     if np.isnan(disparity).all():
         raise ValueError(f"{path}: expected at least one known disparity, all are unknown")
     return from_range(torch.from_numpy(disparity)[None], camera, "disparity")

@@ -173,7 +173,6 @@ class Preparation:
     fill: tuple[str, ...] = ()  # names of the scenes whose holes are inpainted
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if self.size is not None and self.size < _MIN_SIZE:
             raise ValueError(f"size: expected at least {_MIN_SIZE} pixels, or null, got {self.size}")
         expect_room_for(self.size or _MIN_SIZE)

@@ -169,7 +169,6 @@ def _picture(path: Path, name: str, array: np.ndarray) -> Tensor:
 
 
 def _depth(path: Path, name: str, found: Mapping[str, np.ndarray], rgb: Tensor) -> Tensor:
-    """Return a map in metres, (1, H, W)."""
     array = found[name]
     if array.shape != tuple(rgb.shape[1:]):
         raise ValueError(f"{path}: {name}: expected shape {tuple(rgb.shape[1:])} like the image's, got {array.shape}")

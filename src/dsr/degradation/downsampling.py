@@ -89,7 +89,6 @@ class Downsampling:
         return torch.where(block_fraction > 0, depth_lr, torch.nan)
 
     def _apply(self, values: Tensor, scale: int) -> Tensor:
-        """Return the weighted averages of maps without holes."""
         rows, columns = (
             _matrix(self.kernel, self.sigma, size, scale, values.dtype, values.device) for size in values.shape[-2:]
         )

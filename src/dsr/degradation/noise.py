@@ -138,7 +138,6 @@ def no_noise() -> None:
 
 
 def _positive(values: Tensor) -> Tensor:
-    """Return the values with those that are not positive replaced by NaN."""
     return torch.where(values > 0, values, torch.nan)
 
 

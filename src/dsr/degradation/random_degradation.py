@@ -149,7 +149,6 @@ class Everything:
         return low, model.camera(camera, scale)
 
     def _hints(self, clean: Tensor, noisy: Tensor, kernel: str, generator: torch.Generator, *, soft: bool) -> Hints:
-        """Return random hints on a map."""
         named = "gaussian" if kernel == "spread" else kernel
         of_kernel = named if chance(self.told, generator) else None
         of_steps = soft if chance(self.told, generator) else None

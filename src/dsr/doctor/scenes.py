@@ -181,7 +181,6 @@ def _advise(scene: Scene, middle: float) -> str:
 
 
 def _measured(scene: Scene, depth: Array) -> list[Finding]:
-    """Check the measured low-resolution maps against the high-resolution depth."""
     findings = []
     for factor, measured in sorted(scene.measured.items()):
         depth_lr = measured[0].double().numpy()

@@ -84,7 +84,6 @@ def _unfit_prediction(run: Run, scene: str) -> str:
 
 
 def _without(run: Run, scenes: Collection[str]) -> Run:
-    """Return a run without some of its scenes."""
     if not scenes:
         return run
     kept = tuple(scene for scene in run.scenes if scene not in scenes)
@@ -153,7 +152,6 @@ class _Versions(BaseModel, extra="allow"):
 
 
 def _read_scores(path: Path) -> pd.DataFrame:
-    """Return a run's ``scores.csv``; an empty variant is ""."""
     content = io.BytesIO(read_limited(path, MOST_TABLE))
     expected = f"{path}: expected a run's scores, got a damaged or foreign file"
     with refusing(expected, ValueError, KeyError, OverflowError, pd.errors.ParserError):

@@ -56,14 +56,12 @@ class Turns:
         self._lock, self._ended = threading.Lock(), False
 
     def __enter__(self) -> None:
-        """Wait for the lock."""
         self._lock.acquire()
         if self._ended:
             self._lock.release()
             raise CancelledError
 
     def __exit__(self, *_: object) -> None:
-        """Release the lock."""
         self._lock.release()
 
     def end(self) -> None:

@@ -101,7 +101,6 @@ def _blurred_ones(size: Sequence[int], larger: Sequence[int], dtype: torch.dtype
 
 @made_once
 def _kernel(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return the binomial kernel, (1, 1, 5, 5)."""
     taps = torch.tensor((1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16), dtype=dtype, device=device)
     return torch.outer(taps, taps)[None, None]
 

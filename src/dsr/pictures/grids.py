@@ -81,7 +81,6 @@ def draw_grid(columns: Sequence[str], rows: Sequence[Row], texts: tuple[str, str
 
 
 def _wrap(text: str, length: float) -> str:
-    """Wrap a text to lines of at most a given length in inches."""
     return "\n".join(textwrap.wrap(text, max(int(length / _LETTER_WIDTH), 4), break_on_hyphens=False)) or text
 
 

@@ -58,7 +58,6 @@ def save_lights_figure(folder: Path, scene: DepthSample | None = None) -> list[P
 
 
 def _draw_sphere(axes: Axes, shades: np.ndarray, direction: Direction) -> None:
-    """Draw a sphere on white, and an arrow in the direction of the light."""
     axes.imshow(np.ma.masked_invalid(shades), cmap="gray", vmin=0, vmax=1, extent=(-1, 1, 1, -1))
     axes.add_patch(Circle((0, 0), 1, facecolor="none", edgecolor="0.6", linewidth=0.5))
     axes.set(xlim=(-_HALF_WIDTH, _HALF_WIDTH), ylim=(_HALF_WIDTH, -_HALF_WIDTH))
@@ -71,7 +70,6 @@ def _draw_sphere(axes: Axes, shades: np.ndarray, direction: Direction) -> None:
 
 
 def _draw_frame(axes: Axes) -> None:
-    """Draw the axes of the camera frame."""
     axes.set(xlim=(-0.5, 1.35), ylim=(1.35, -0.5))
     style = {"arrowstyle": "-|>", "color": "0.15", "linewidth": 1.2, "shrinkA": 5, "shrinkB": 0}
     for name, end in (("x", (0.8, 0.0)), ("y", (0.0, 0.8))):

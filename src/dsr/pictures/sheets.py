@@ -75,7 +75,6 @@ def save_contact_sheet(path: Path, scenes: Iterable[Scene], title: str) -> list[
 
 
 def _row(scene: Scene) -> _Row:
-    """Collect what a sheet shows of a scene."""
     depth, camera, what = _shown_map(scene)
     view = scene.camera
     axes = ((view.width, view.fx, view.cx), (view.height, view.fy, view.cy))
@@ -124,7 +123,6 @@ def _shown_map(scene: Scene) -> tuple[Tensor, Camera, list[str]]:
 
 
 def _save_page(path: Path, rows: list[_Row], title: str) -> None:
-    """Draw a page and write it."""
     sides = [[_PANEL * side / max(row.shape) for side in row.shape] for row in rows]
     sizes = [(max(width, _LEAST_PANEL), max(height, _LEAST_PANEL)) for height, width in sides]  # inches
     heights = [max(size[1] + _BELOW, (row.text.count("\n") + 2) * _LINE) for row, size in zip(rows, sizes, strict=True)]

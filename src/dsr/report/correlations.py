@@ -123,7 +123,6 @@ def write_correlations(folder: Path, results: Results) -> list[Path]:
 
 
 def _ranking_text(ranking: pd.DataFrame, count: int) -> str:
-    """Format the table of correlations with LPIPS_v as Markdown."""
     title = f"## Correlation with {REFERENCE}\n\n"
     if ranking.empty:
         return f"{title}There is no {REFERENCE} in these {count} results (metrics.lpips=true computes it).\n"
@@ -222,7 +221,6 @@ def method_colours(labels: Sequence[str]) -> dict[str, str]:
 
 
 def _limits(values: pd.Series) -> tuple[float, float]:
-    """Return the range of an axis with a margin."""
     finite = values.dropna()
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
     margin = 0.06 * (high - low) or 0.06 * abs(high) or 0.5
@@ -276,7 +274,6 @@ def _label(axis: Axes, row: int, column: int, count: int) -> None:
 
 
 def _head(figure: Figure, count: int, colours: Mapping[str, str], *, has_reference: bool) -> None:
-    """Write the title and the legend."""
     width, height = figure.get_size_inches()
     reference = f"{REFERENCE} is highlighted" if has_reference else f"no {REFERENCE} in these results"
     text = (
@@ -297,7 +294,6 @@ def _head(figure: Figure, count: int, colours: Mapping[str, str], *, has_referen
 
 
 def _ranking(ranking: pd.DataFrame, count: int) -> Figure:
-    """Draw the correlations of all metrics with LPIPS_v, the strongest on top."""
     rows = len(ranking)
     height = 0.19 * rows + 0.85
     figure = Figure(figsize=(5.6, height))

@@ -51,7 +51,6 @@ def save_dashboard(run: Run) -> None:
 
 
 def _write_scores(writer: SummaryWriter, run: Run) -> None:
-    """Write scalars, their layout, and the run's row in the table of runs."""
     scored = list(run.scores["scene"].unique())
     means: dict[str, float] = {}
     more = {name: KNOWN_FORMATS[name] for name in LOOKS if (run.scores["metric"] == name).any()}

@@ -226,5 +226,4 @@ def _agreement(errors: Tensor) -> dict[str, dict[str, Any]]:
 
 
 def _finite(value: Tensor) -> float | None:
-    """Return a number for JSON."""
     return float(value) if value.isfinite() else None

@@ -64,7 +64,6 @@ def published_row(scene: str, method: str, scale: float) -> pd.Series | None:
 
 @functools.cache
 def _published_rows() -> dict[tuple[str, str, float], pd.Series]:
-    """Return the rows of :func:`published` by scene, method and scale."""
     return {(row["scene"].casefold(), row["method"], int(row["scale"])): row for _, row in published().iterrows()}
 
 
@@ -212,6 +211,5 @@ def _paper_set(title: str, places: Sequence[Place], count: int, published: str =
 
 
 def _counted(title: str, places: Sequence[Place]) -> SceneSet:
-    """Return an average that is not in the paper."""
     count = f"{len(places)} scenes" if len(places) > 1 else "1 scene"
     return SceneSet(f"{title}, average of {count}", tuple(places))

@@ -166,7 +166,6 @@ def is_view(path: Path) -> bool:
 
 
 def _after(result: ViewedResult, vertices: int, limits: Mapping[str, tuple[float, ...]]) -> Grid:
-    """Return the surface of the result, with the errors where there are any."""
     grid = _reduce(result.depth, result.camera, vertices)
     if result.filled is not None:
         grid = replace(grid, filled=reduce_mask(result.filled, grid.factor) & np.isfinite(grid.depth))
@@ -311,7 +310,6 @@ def _blocks(values: np.ndarray, factor: int) -> np.ndarray:
 
 
 def _flags(grid: Grid) -> np.ndarray:
-    """Return the flags of the pixels, (h, w) uint8."""
     flags = np.where(grid.doubtful, DOUBTFUL, 0).astype(np.uint8)
     if grid.filled is not None:
         flags |= np.where(grid.filled, FILLED, 0).astype(np.uint8)

@@ -283,7 +283,6 @@ def _terminal_table(run: Run, values: str, caption: str) -> Table:
 
 
 def _values(key: str, column: MetricFormat, row: Row) -> Iterator[tuple[str, float | int | None]]:
-    """Yield the CSV columns of one metric."""
     cell, paper = row.cells.get(key), row.published.get(key)
     unit = f" [{column.unit.split(', ')[-1]}]" if column.unit else ""  # the key names the threshold
     low, high = (None, None) if cell is None or cell.interval is None else cell.interval
@@ -301,7 +300,6 @@ def _values(key: str, column: MetricFormat, row: Row) -> Iterator[tuple[str, flo
 
 
 def _of_paper(row: Row) -> Row:
-    """Return a row of the paper's values with a label that says so."""
     return replace(row, label=f"{row.label} (paper)")
 
 
@@ -359,7 +357,6 @@ def _latex_rows(group: Group, facts: Sequence[Fact], columns: Formats, *, publis
 
 
 def _beside(row: Row, facts: Sequence[Fact], columns: Formats, *, first: bool) -> list[str]:
-    """Format our values, without spreads and intervals, and the paper's."""
     cells = {key: replace(cell, spread=None, seeds=1, interval=None) for key, cell in row.cells.items()}
     ours = _LATEX.row(replace(row, cells=cells, seeds=1), facts, columns, first=first)
     paper = _LATEX.paper(columns, row.published)

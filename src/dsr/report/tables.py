@@ -270,7 +270,6 @@ def rows_of(
 
 
 def _columns_of(row: pd.Series | None, formats: Formats) -> dict[str, float]:
-    """Return the paper's values by column."""
     if row is None:
         return {}
     return {key: float(row[key]) for key in (*formats, *_SHARES) if pd.notna(row.get(key))}
@@ -379,7 +378,6 @@ def _remarks(runs: Sequence[Run], places: Collection[Place]) -> Iterator[str]:
 
 
 def _notes(groups: Sequence[Group], columns: Formats) -> Iterator[str]:
-    """Yield the notes of a table."""
     rows = [row for group in groups for row in group.rows]
     cells = [cell for row in rows for cell in row.cells.values()]
     metrics = {key: each for key, each in columns.items() if key not in _SHARES}

@@ -235,7 +235,6 @@ _DUSK = np.array(((0.13, 0.15, 0.33), (0.24, 0.38, 0.58), (0.60, 0.68, 0.72), (0
 
 
 def _plain(*rgb: float) -> Field:
-    """Return the paint of one linear RGB colour."""
     return lambda points: np.broadcast_to(np.array(rgb)[:, None], points.shape)
 
 

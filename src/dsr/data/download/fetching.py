@@ -121,7 +121,6 @@ class Checksums(dict[str, Entry]):
 
 
 def _entry(name: str, fields: Any) -> Entry:
-    """Return an entry from its JSON."""
     sha256, size, files = fields.get("sha256"), fields.get("size"), fields.get("files")
     digest = sha256 is None or (isinstance(sha256, str) and re.fullmatch(r"[0-9a-f]{64}", sha256) is not None)
     sizes = (size, *(() if files is None else files.values()))
@@ -494,7 +493,6 @@ def _misses(collection: Collection, checksums: Checksums) -> Iterator[str]:
 
 
 def _matches(collection: Collection, root: Path, pattern: str) -> Iterator[Path]:
-    """Yield the files that the user put in place."""
     return (path for path in (root / collection.folders[0]).glob(pattern) if path.is_file())
 
 

@@ -380,6 +380,5 @@ class _Norm(nn.BatchNorm2d):
 
 
 def _block(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Sequential:
-    """Return a convolution, normalisation and activation."""
     convolution = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2)
     return nn.Sequential(convolution, _Norm(outputs), nn.LeakyReLU(0.2, inplace=True))

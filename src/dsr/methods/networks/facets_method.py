@@ -152,7 +152,6 @@ class AnyMap(Method):
         return Surface(depth, depth_error, torch.rad2deg(angle), _describe_noise(padded, answer))
 
     def _answer(self, rgb: Tensor, inverse: Tensor, noise: Tensor | None, progress: Steps | None) -> Answer:
-        """Return the network's answer, with the noise if it is given."""
         facts = self._facts.to(self._device).clone()
         facts[0, -1] = noise is not None
         return self._net.answer(rgb, inverse, None if noise is None else noise.float(), facts, progress)

@@ -126,7 +126,6 @@ class FacetsUNet(DisparityNetwork):
                 parameter.requires_grad_(False)
 
     def _expect(self, first: DisparityNetwork, kinds: tuple[type, ...], sizes: Sequence[str]) -> None:
-        """Raise a ValueError for a network of another kind or of other sizes."""
         own, theirs = ({key: net.arguments().get(key) for key in sizes} for net in (self, first))
         if not isinstance(first, kinds) or own != theirs:
             names = " or ".join(kind.__name__ for kind in kinds)

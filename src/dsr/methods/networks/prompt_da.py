@@ -143,7 +143,6 @@ def _load(folder: Path) -> tuple[nn.Module, int]:
 
 
 def _read_config(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return what a configuration says of the network and of its backbone."""
     with refusing(f"{path}: expected a configuration of JSON, got something else", ValueError, RecursionError):
         content = parse_json(read_limited(path))
     kind = content.get("model_type") if isinstance(content, Mapping) else None

@@ -68,7 +68,6 @@ def find_weights(node: Any, scale: float, method: str) -> Path:
 
 
 def _where_to_get(node: Mapping[str, Any], scale: float, published: list[str]) -> str:
-    """Return where to get the weights of a node."""
     packaged, needs = node.get("packaged"), f"scale {round_ratio(scale)} needs weights=FILE"
     if published:
         needs += f", or a directory with {published[0]} (from {node.get('source')})"

@@ -172,7 +172,6 @@ def read_answers(file: Path, key: Key) -> Answers:
 
 
 def _expect_choices(where: str, trial: Answer, key: Key) -> None:
-    """Check that both choices were made among the pictures of the scene."""
     if trial.scene not in key.trials:
         raise ValueError(f"{where}.scene: expected one of the study's, got {trial.scene!r}")
     candidates = key.trials[trial.scene].candidates
@@ -189,7 +188,6 @@ def _expect_choices(where: str, trial: Answer, key: Key) -> None:
 
 
 def _expect_all(file: Path, given: Sequence[Answer], key: Key) -> None:
-    """Check that a file has exactly the scenes shown to one participant."""
     fresh = [answer.scene for answer in given if not answer.again]
     again = [answer.scene for answer in given if answer.again]
     for scenes, number, what in ((fresh, key.scenes_per_person, "scenes"), (again, key.repeat, "repeated scenes")):

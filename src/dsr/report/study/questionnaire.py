@@ -180,7 +180,6 @@ def grey_png(shades: np.ndarray, valid: np.ndarray) -> bytes:
 
 
 def _hash(*parts: bytes) -> str:
-    """Return the id of some bytes."""
     digest = hashlib.sha256()
     for part in parts:
         digest.update(len(part).to_bytes(8, "big") + part)

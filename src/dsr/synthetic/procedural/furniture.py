@@ -36,7 +36,6 @@ Parts = list[Shape]
 
 
 def _rod(start: Array | list[float], end: Array | list[float], radius: float) -> Shape:
-    """Return a round bar."""
     return tube(np.linspace(start, end, 3), radius, 14)
 
 
@@ -321,7 +320,6 @@ def _place(
 
 
 def _boxes(rng: np.random.Generator) -> list[Shape]:
-    """Return two boxes, one on the other."""
     boxes = [box(rng.uniform(0.25, 0.6, 3)).turn(2, rng.uniform(-30, 30)) for _ in range(2)]
     return [boxes[0], boxes[1].translate(0, 0, boxes[0].vertices[:, 2].max() + 1e-3)]
 
@@ -422,7 +420,6 @@ def tableware(rng: np.random.Generator, scene: SceneBuilder, wide: float, deep: 
 
 
 def _books(rng: np.random.Generator, large: float) -> Shape:
-    """Return a pile of books."""
     z, books = 0.0, []
     for _ in range(rng.integers(1, 6)):
         book = box(large * rng.uniform([0.6, 0.8, 0.08], [0.8, 1.0, 0.22])).turn(2, rng.uniform(-25, 25))

@@ -98,12 +98,10 @@ class Tracer:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return the cross product of (3, N) vectors."""
     return np.stack((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
 
 
 def _unit_columns(vectors: Array) -> Array:
-    """Return vectors (3, N) at length 1."""
     return vectors / np.maximum(np.sqrt((vectors**2).sum(0)), 1e-300)
 
 
