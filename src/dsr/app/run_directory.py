@@ -159,11 +159,7 @@ def degradation_of(config: Config, *, assumes: bool = False) -> str:
 
 
 def expect_free(folder: Path, config: Config, identity: Identity, tolerated: Sequence[str] = ()) -> list[str]:
-    """Check that ``folder`` can become the directory of this run, and return the ``tolerated`` keys that differ.
-
-    Nothing is written. Something else that is there already is refused without ``overwrite``, as is a link that leads
-    out of the directory.
-    """
+    """Check that ``folder`` can become the directory of this run, and return the ``tolerated`` keys that differ."""
     try:
         expect_target(folder, folder=True)
         if folder.is_dir():

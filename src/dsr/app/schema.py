@@ -63,12 +63,7 @@ def _is_count(value: object, most: float = math.inf) -> bool:
 
 @dataclass
 class RunConfig:
-    """The configuration that all commands have.
-
-    The groups (dataset, downsampling, noise, method, model) are nodes, whose keys
-    :func:`dsr.utils.configuration.build` checks against what the class or function that they name takes. ``names`` has
-    the choices of the groups.
-    """
+    """The configuration that all commands have; ``names`` has the choices of the groups, which are nodes."""
 
     names: dict[str, Any] = field(default_factory=lambda: {"dataset": None})
     dataset: dict[str, Any] = MISSING

@@ -26,8 +26,7 @@ _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13
 def read_variables(path: Path) -> dict[str, np.ndarray]:
     """Return the matrices of numbers in a MATLAB file, of versions 5 to 7.3, by name.
 
-    A field of a structure is named "structure.field"; cells, text and sparse matrices are left out. Version 5 is read
-    by its published description ("MAT-File Format", MathWorks), 7.3 as the HDF5 that it is.
+    A field of a structure is named "structure.field"; cells, text and sparse matrices are left out.
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected a MATLAB file, there is none")

@@ -108,11 +108,7 @@ DETECTED = ((find_files, load_files, "nyu"),)
 
 
 class NYU(PreparedDataset):
-    """Labelled frames of NYU Depth v2: indoor scenes of a Kinect (Silberman et al., ECCV 2012).
-
-    A ``split`` is as in the literature on guided depth super-resolution: 640 x 480 pixels with the border and the
-    inpainted depth, whatever ``size``, ``crop`` and ``filled`` are.
-    """
+    """Labelled frames of NYU Depth v2: indoor scenes of a Kinect (Silberman et al., ECCV 2012)."""
 
     def __init__(
         self,

@@ -36,20 +36,12 @@ _MAX_HASHED = 1 << 28  # largest size in bytes of files whose content is hashed
 
 
 class SceneSource:
-    """A data set: named scenes that are loaded one at a time.
+    """A data set: named scenes that are loaded one at a time."""
 
-    Attributes:
-        name: name in ``scores.csv``.
-        evaluation: whether methods are compared on its scenes, so that none may be trained on them.
-        regions: names of the regions that its scenes may have, in the order of tables.
-        soft_edges: whether pixels at depth steps are mixtures of both sides.
-
-    """
-
-    name: str
-    evaluation: bool
-    regions: tuple[str, ...] = ()
-    soft_edges: bool = False
+    name: str  # in ``scores.csv``
+    evaluation: bool  # whether methods are compared on its scenes, so that none may be trained on them
+    regions: tuple[str, ...] = ()  # names of those that its scenes may have, in the order of tables
+    soft_edges: bool = False  # whether pixels at depth steps are mixtures of both sides
     _scenes: Sequence[str]
 
     def scenes(self) -> list[str]:
@@ -191,12 +183,8 @@ class Preparation:
 class PreparedDataset(SceneSource):
     """A data set in its original format; the base class of those in this package.
 
-    Args:
-        found: records of the scenes on disk.
-        scenes: names of the scenes to use; None for those of ``named``, ``found`` for all that are on disk.
-        named: names of the scenes that belong to the data set; None for all that are on disk.
-        count: number of scenes that belong to the data set, if their names are not known.
-
+    ``named`` are the names of the scenes that belong to it, None for all that are on disk, ``count`` is their number if
+    their names are not known.
     """
 
     evaluation = True

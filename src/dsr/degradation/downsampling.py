@@ -153,18 +153,9 @@ def make_sample(
 ) -> DepthSample:
     """Return the super-resolution problem of a scene.
 
-    An image whose size is not a multiple of a whole scale is cropped at the bottom and the right, with a note.
-
-    Args:
-        scene: the high-resolution maps.
-        scale: the upsampling factor: 2, 4, 8 or 16 with a model; for a measured map its ratio (to within 1 %), or
-            ``native`` for that of the scene's only one.
-        downsampling: the model, or :class:`Measured` for the scene's own low-resolution map.
-        range_type: range type that the method works on.
-        noise: noise of the low-resolution map, unless it is measured.
-        generator: random generator of noise and holes, or a seed, from which each scene gets generators of its own.
-        holes: holes of the low-resolution map.
-
+    ``scale`` is 2, 4, 8 or 16 with a model; for a measured map its ratio (to within 1 %), or ``native`` for that of the
+    scene's only one. ``generator`` is of noise and holes; from a seed, each scene gets generators of its own. An image
+    whose size is not a multiple of a whole scale is cropped at the bottom and the right, with a note.
     """
     if isinstance(downsampling, Measured):
         with naming(scene.name):

@@ -174,22 +174,15 @@ class InverseSurface(NamedTuple):
 
 
 class Method(abc.ABC):
-    """A depth super-resolution method: a network, a per-image optimisation or a classical filter.
-
-    Attributes:
-        abilities: what it can do.
-        range_type: the range type that it works on. By default the downsampling model is applied to that
-            type, too, as in the paper, which evaluates every method on the type that it was designed for.
-        history: of the last call of a method that iterates, one entry per recorded iteration: ``iteration`` first, then
-            the method's own quantities, such as ``objective`` and ``moved``. None for others.
-        name: in scores and tables, of a method that takes it from its input; None for that of its file of ``conf``.
-
-    """
+    """A depth super-resolution method: a network, a per-image optimisation or a classical filter."""
 
     abilities: ClassVar[Abilities] = Abilities()
+    # The range type that it works on. By default the downsampling model is applied to that type, too, as in the paper,
+    # which evaluates every method on the type that it was designed for.
     range_type: RangeType = "disparity"
+    # Of the last call of a method that iterates, an entry per recorded iteration, ``iteration`` first; None for others
     history: list[dict[str, float]] | None = None
-    name: str | None = None
+    name: str | None = None  # in tables, of a method that takes it from its input; None for that of its file
 
     @classmethod
     def abilities_of(cls, node: Node) -> Abilities:

@@ -21,16 +21,11 @@ from dsr.metrics.lpips import LPIPS
 
 
 class PerImageMean(torchmetrics.Metric):
-    """Mean over images of one metric.
+    """Mean over images of one metric, or of the one of a name, as in ``scores.csv``.
 
     An image whose target has no valid pixel is left out. If a prediction has no pixel that can be scored, the mean is
-    NaN, so that a method that fails never looks better than one that does not.
-
-    Args:
-        metric: from :func:`dsr.metrics.catalogue.catalogue`, or the name of one, as in ``scores.csv``.
-        variant: ``max`` (worst of four lights, the smallest value where higher is better), ``avg`` or one of e1..e4;
-            has no effect on metrics without lights.
-
+    NaN, so that a method that fails never looks better than one that does not. ``variant``, one of ``VARIANTS``, has no
+    effect on metrics without lights; ``max`` is the worst light, the smallest value if higher is better.
     """
 
     is_differentiable = False

@@ -76,17 +76,10 @@ def opw(
     The frame before is warped with a z-buffer: what a surface hides does not count, and what appears is a hole. Here it
     is a weighted mean in metres; the authors' code normalises disparity.
 
-    Args:
-        depths: (T, 1, H, W) orthogonal depth in metres, T at least 2; NaN is a hole.
-        camera: of all frames.
-        poses: (T, 4, 4) transforms from the camera's frame (x right, y down, z forward) to the world's, metres.
-        photos: (T, 3, H, W) in 0 to 1: pixels weigh exp(-50 d^2), where d^2 is the sum of the squared differences of a
-            pixel's colours, so that what moves counts less. None for equal weights.
-        static: (T, 1, H, W) bool, the pixels of each frame to compare; None for all.
-
-    Returns:
-        () in metres, the mean over the pairs of frames; NaN if one has nothing to compare.
-
+    Depths are (T, 1, H, W) orthogonal depth in metres, T at least 2, ``poses`` (T, 4, 4) transforms from the camera's
+    frame (x right, y down, z forward) to the world's, ``static`` (T, 1, H, W) bool the pixels to compare. With
+    ``photos`` (T, 3, H, W) in 0 to 1, pixels weigh exp(-50 d^2), where d^2 is the sum of the squared differences of
+    their colours, so that what moves counts less. NaN if a pair of frames has nothing to compare.
     """
     known = _known(depths) if static is None else _known(depths) & static
     frames = [as_rigid(np.asarray(each), f"poses: {number}") for number, each in enumerate(poses)]

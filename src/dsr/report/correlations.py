@@ -24,7 +24,7 @@ from dsr.metrics.formats import HEADLINES, LIGHTS_NOTE, PAPER, Formats, by_famil
 from dsr.pictures.canvas import write_figure
 from dsr.report.paper import published
 from dsr.report.table_layouts import MISSING, aligned, escaped
-from dsr.utils.files import replacing, write_text
+from dsr.utils.files import write_text
 
 Kind = Literal["pearson", "spearman"]
 KINDS: tuple[Kind, ...] = ("pearson", "spearman")
@@ -109,17 +109,11 @@ def write_correlations(folder: Path, results: Results) -> list[Path]:
     paper = with_reference(of_paper).add_prefix("paper_").rename(columns={"paper_metric": "metric"})
     ranking = with_reference(matrix).merge(paper, "left", "metric").astype({"paper_n": "Int64"})
     tables = {kind: correlate(matrix, kind) for kind in KINDS} | {"pairs": pairs(matrix)}
-    paths = []
-    for name, table in tables.items():
-        paths.append(folder / f"{name}.csv")
-        with replacing(paths[-1]) as temporary:
-            table.to_csv(temporary, index_label="metric")
-    paths.append(folder / "with_lpips.csv")
-    with replacing(paths[-1]) as temporary:
-        ranking.to_csv(temporary, index=False)
-    paths.append(folder / "with_lpips.md")
-    write_text(paths[-1], _ranking_text(ranking, len(matrix)))
-    return paths
+    texts = {f"{name}.csv": table.to_csv(index_label="metric") for name, table in tables.items()}
+    texts |= {"with_lpips.csv": ranking.to_csv(index=False), "with_lpips.md": _ranking_text(ranking, len(matrix))}
+    for name, text in texts.items():
+        write_text(folder / name, text)
+    return [folder / name for name in texts]
 
 
 def _ranking_text(ranking: pd.DataFrame, count: int) -> str:
@@ -206,11 +200,7 @@ def scatter_matrix(matrix: pd.DataFrame, labels: list[str], formats: Formats) ->
 
 
 def method_colours(labels: Sequence[str]) -> dict[str, str]:
-    """Return a colour per label as ``#rrggbb``.
-
-    The colour of a method in ``FIXED`` does not depend on the other labels; other methods take the free
-    colours in order.
-    """
+    """Return a colour per label as ``#rrggbb``: that of a method in ``FIXED``, or the next free one."""
     others = [label for label in dict.fromkeys(labels) if label not in FIXED]
     free = dict(zip(others, _FREE, strict=False))
     for number, label in enumerate(others[len(_FREE) :], len(_FREE)):

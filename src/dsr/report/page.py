@@ -58,9 +58,7 @@ def save_page(
 ) -> list[str]:
     """Write a page with the scores, renderings, errors, times and settings of runs, atomically; return notes on it.
 
-    The page works as a local file, without a server, and links to the tables, figures and correlations beside it. It
-    computes the renderings from 8-bit normals, so they differ from :func:`dsr.geometry.surface.render` by quantization
-    only. The tables of a ``leaderboard`` begin with the methods by mean rank.
+    It links to the tables, figures and correlations beside it; a ``leaderboard`` begins with the methods by mean rank.
     """
     results = pictures.results
     problems = results.problems()

@@ -132,11 +132,7 @@ def pack_result(result: ViewedResult, vertices: int, photo_side: int) -> Packed:
 
 
 def save_view(path: Path, results: Sequence[Packed], *, title: str, notes: Sequence[str] = ()) -> None:
-    """Write the page of some results, at least one, atomically.
-
-    A content security policy allows the page's own script, style and pictures alone, so that it cannot ask any server.
-    All names are escaped, or shown as text by the script.
-    """
+    """Write the page of some results, at least one, atomically; all names are escaped, or shown as text."""
     style, script = asset("view.css"), f'"use strict";\n{asset(*_SCRIPTS)}'
     content = {
         "title": title,

@@ -64,16 +64,9 @@ class WholeScenes(Dataset[Batch]):
 class PatchData(lightning.LightningDataModule):
     """Patches of data sets to train on, and whole scenes to validate with: the last ones of each, and other data sets.
 
-    Args:
-        parts: the data sets to train on.
-        settings: how patches are cropped and augmented.
-        degradation: how low-resolution maps are made.
-        seed: seed of the patches and of the noise of validation scenes.
-        validation: more data sets to validate with, by name; their scenes without a true depth are left out.
-        everything: the distribution of degradations to train on in place of ``degradation``.
-        patches_per_step: of all devices and batches of a step; None for those of one batch.
-        device: what ``auto`` in ``settings`` depends on where there is no trainer yet.
-
+    Scenes to validate with that lack a true depth are left out. ``everything`` is a distribution of degradations to
+    train on in place of ``degradation``, ``patches_per_step`` is of all devices and batches of a step, None for one
+    batch, and ``device`` is what ``auto`` in ``settings`` depends on if there is no trainer yet.
     """
 
     def __init__(

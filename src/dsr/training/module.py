@@ -61,15 +61,9 @@ class SuperResolution(lightning.LightningModule):
     Validations log the scores of the network, ``val/METRIC``, and of bicubic interpolation of the same maps,
     ``bicubic/METRIC``, which are computed in the first validation.
 
-    Args:
-        net: the network.
-        objective: the loss.
-        optimizer: function that makes the optimiser of parameters, such as a ``functools.partial``.
-        scheduler: function that makes the schedule of an optimiser, which is updated after every step.
-        average: decay of the moving average of the weights, smaller in the first steps; 0 for the weights themselves.
-        metrics: function that makes the metrics of a validation set.
-        validation_sets: names of the validation sets, in the order of the loaders.
-
+    ``scheduler`` makes the schedule of an optimiser, which is updated after every step; ``average`` is the decay of the
+    moving average of the weights, smaller in the first steps, 0 for the weights themselves; ``validation_sets`` are
+    names, in the order of the loaders.
     """
 
     logs_curves = True  # adds the callback Curves, unless the trainer has one

@@ -153,19 +153,12 @@ class SurfaceObjective(Objective):
     Lap_1 compares disparities divided by the truth's median. The RMSE of the divided disparities is added, with a
     larger weight where the truth's depth steps are soft. The expected errors are the scales of Laplace distributions,
     of the logarithm of disparity and of the angle between the normals.
-
-    Args:
-        depth: K.
-        soft: weight of the RMSE of maps with soft depth steps.
-        sharp: weight of the RMSE of maps with sharp depth steps.
-        errors: weight of each of the two negative logarithms of likelihoods.
-
     """
 
-    depth: float = 20.0
-    soft: float = 8.0
-    sharp: float = 2.0
-    errors: float = 0.02
+    depth: float = 20.0  # K
+    soft: float = 8.0  # weight of the RMSE of maps with soft depth steps
+    sharp: float = 2.0  # and of those with sharp ones
+    errors: float = 0.02  # weight of each of the two negative logarithms of likelihoods
 
     @property
     def formula(self) -> str:

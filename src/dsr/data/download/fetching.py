@@ -157,9 +157,8 @@ def get(
 ) -> list[str]:
     """Fetch files that are missing or differ from their record; return what could not be had and why, a line each.
 
-    An interruption keeps what has come of a file beside it, ``.part``, and the next call goes on from there. A full
-    disk ends the call. ``mirror`` is the address of a server to try first, which has each file under its path.
-    Archives that were there before are kept anyway.
+    ``mirror`` is the address of a server to try first, which has each file under its path. Archives that were there
+    before are kept anyway.
     """
     problems: list[str] = []
     root.mkdir(parents=True, exist_ok=True)

@@ -157,12 +157,7 @@ def _take_sides(reachable: Tensor, barrier: Tensor, hr: Tensor, scale: int) -> N
 
 @dataclass(eq=False)
 class EdgeGuided(Method):
-    """Edge-guided upsampling of the low-resolution disparity.
-
-    Attributes:
-        history: of the last call: iterations (over all stages), energy of the labels, largest change of a message.
-
-    """
+    """Edge-guided upsampling of the low-resolution disparity; ``history`` is that of the labels of all stages."""
 
     abilities = Abilities(cost=Cost(1500, 12))
 

@@ -76,11 +76,7 @@ class Guided:
 class GuidedMethod(Method):
     """A guided filter of the low-resolution disparity: everything but :meth:`filter_maps`.
 
-    Args:
-        fill_holes: whether holes of the low-resolution map are inpainted; otherwise a high-resolution pixel whose
-            nearest low-resolution pixel is a hole is a hole.
-        slopes: whether each low-resolution pixel stands for a plane, see the module.
-
+    Unless holes are filled, a high-resolution pixel whose nearest low-resolution pixel is a hole is one, too.
     """
 
     abilities = Abilities(ratios="any", own_size=True, cost=Cost(600, 2))

@@ -306,11 +306,6 @@ class ShapeFromShading(Method):
     """Variational super-resolution from shading.
 
     Holes of the input are inpainted. The low-resolution map is assumed to hold block means of depth.
-
-    Attributes:
-        history: of the last call: the ``objective``, its terms, the ``residual``, which is the RMS difference of theta
-            and the slopes, and the RMS movement of z relative to the median depth, ``moved``.
-
     """
 
     abilities = Abilities(fast_on="cpu", cost=Cost(1300, 60))

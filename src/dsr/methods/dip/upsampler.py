@@ -56,16 +56,6 @@ class DeepImagePrior(Method):
 
     Each image has its own network and its own random numbers, which depend on the seed, the data set, the scene and the
     scale only, not on other images.
-
-    Args:
-        downsampling: assumed downsampling model of the low-resolution map.
-        precision: dtype of the convolutions.
-        metrics: function that returns the metrics of a validation pass; None for none.
-        workspace: directory for logs; None for no logs.
-        display: display of the progress.
-        about: what TensorBoard's table of runs says of an image: ``method`` and ``degradation``; None for not known.
-        lpips_trunk: file of AlexNet's weights for ``visual=lpips``; None to use torch's hub cache.
-
     """
 
     abilities = Abilities(ratios="whole", optimises=True, assumes_downsampling=True, cost=Cost(2500, 2300, program=6e8))
@@ -91,10 +81,10 @@ class DeepImagePrior(Method):
     seed: int = 0
     device: torch.device | str = "cpu"
     metrics: Callable[[], torchmetrics.MetricCollection] | None = None
-    workspace: Path | None = None
+    workspace: Path | None = None  # directory for logs; None for no logs
     display: Progress | None = None
-    about: Mapping[str, str] | None = None
-    lpips_trunk: str | Path | None = None
+    about: Mapping[str, str] | None = None  # what TensorBoard's table of runs says of an image
+    lpips_trunk: str | Path | None = None  # file of AlexNet's weights; None to use torch's hub cache
 
     def __post_init__(self) -> None:
         self.device = torch.device(self.device)

@@ -173,16 +173,11 @@ def expect_rgb_size(rgb: Tensor, values_lr: Tensor, scale: int) -> None:
 
 
 class NetworkUpsampler(Method):
-    """A method that is a trained network.
+    """A method that is a trained network, which is copied; ``precision`` is the dtype of its convolutions alone.
 
-    Args:
-        net: the network; it is copied.
-        precision: dtype of the convolutions; all other computations use the depth's dtype.
-        ensemble: number of test-time augmentations: 1 for none, 4 for the rotations by multiples of 90 degrees, 8 for
-            these and their mirror images. The results are transformed back and averaged: the geometric self-ensemble of
-            Timofte, Rothe, Van Gool, *Seven Ways to Improve Example-Based Single Image Super Resolution*, CVPR 2016.
-        tile: side of a tile in high-resolution pixels; None for ``TILE``, and no tiles up to ``UNTILED`` pixels.
-
+    An ``ensemble`` of 4 averages the results of the rotations by multiples of 90 degrees, one of 8 also those of their
+    mirror images (Timofte, Rothe, Van Gool, *Seven Ways to Improve Example-Based Single Image Super Resolution*, CVPR
+    2016). ``tile`` is the side of a tile in high-resolution pixels; None for ``TILE``, and no tiles up to ``UNTILED``.
     """
 
     abilities = Abilities(repeats=True, needs="network", cost=Cost(40, photo=40, tile=700))
