@@ -151,7 +151,7 @@ DAMAGES = {
 def test_damaged_or_foreign_weights_file_is_refused_in_one_line(tmp_path, kind):
     path = tmp_path / "alexnet.pth"
     DAMAGES[kind](path)
-    with pytest.raises(ValueError, match="expected the weights of torchvision's AlexNet: ") as caught:
+    with pytest.raises(ValueError, match=r"expected (the weights|a torch file|a network's tensors)") as caught:
         load_lpips(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)

@@ -396,9 +396,9 @@ def test_scenes_of_several_threads_are_predicted_one_at_a_time_and_written_as_on
     assert rows(tmp_path / "together") == rows(tmp_path / "apart")
 
 
-def test_no_prediction_begins_after_the_end_of_turns(tmp_path):
+def test_no_prediction_begins_after_an_interruption(tmp_path):
     study = toy_study(tmp_path)
-    study.turns.end()
+    study.ended.set()
     with pytest.raises(CancelledError):
         evaluate_scene(study, "a")
     assert not (tmp_path / "predictions").exists()

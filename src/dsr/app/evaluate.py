@@ -341,7 +341,7 @@ def _in_threads(
                 if result is not None:
                     yield scene, result
         except BaseException:  # no further prediction begins
-            study.turns.end()
+            study.ended.set()
             beside.shutdown(cancel_futures=True)
             raise
 

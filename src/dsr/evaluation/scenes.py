@@ -49,26 +49,6 @@ SCORE_COLUMNS = (
 Illustrate = Callable[[DepthSample, Tensor, tuple[Tensor, Tensor] | None, Mapping[str, float]], None]
 
 
-class Turns:
-    """A lock for predictions, of which threads make one at a time; after its end it refuses to be taken."""
-
-    def __init__(self) -> None:
-        self._lock, self._ended = threading.Lock(), False
-
-    def __enter__(self) -> None:
-        self._lock.acquire()
-        if self._ended:
-            self._lock.release()
-            raise CancelledError
-
-    def __exit__(self, *_: object) -> None:
-        self._lock.release()
-
-    def end(self) -> None:
-        """Let those that wait for the lock fail, as after an interruption."""
-        self._ended = True
-
-
 @dataclass(frozen=True)
 class Evaluation:
     """The evaluation of one method on one data set."""
@@ -89,7 +69,8 @@ class Evaluation:
     alignment: str = "none"  # of each prediction before it is scored and drawn
     label: str = ""  # name in tables; empty for ``method_name``
     illustrate: Illustrate = lambda *_: None
-    turns: Turns = field(default_factory=Turns)
+    turns: threading.Lock = field(default_factory=threading.Lock)  # for threads, which predict one at a time
+    ended: threading.Event = field(default_factory=threading.Event)  # after an interruption: no prediction begins
 
     def sample(self, scene: str) -> DepthSample:
         """Return the method's input for a scene; a ValueError if a file of the scene is invalid."""
@@ -170,6 +151,8 @@ def _predict(study: Evaluation, scene: str, config: Mapping[str, Any], progress:
     """Compute one prediction; write it, its sample and the iteration's history; return the method's seconds."""
     sample = study.sample(scene)
     with study.turns, progress.task("steps") as step:
+        if study.ended.is_set():
+            raise CancelledError
         start = time.perf_counter()
         surface = study.method.surface(sample, step)
         seconds, history = time.perf_counter() - start, study.method.history

@@ -7,7 +7,6 @@ with torchmetrics. The trunk is torchvision's ImageNet AlexNet, found by :func:`
 import http.client
 import importlib.metadata
 import socket
-import warnings
 from pathlib import Path
 
 import torch
@@ -15,7 +14,9 @@ from torch import Tensor, nn
 from torch.nn.utils import skip_init
 
 from dsr.metrics.functional import SurfacePair
+from dsr.utils.arrays import read_tensors
 from dsr.utils.compute_device import in_own_precision
+from dsr.utils.guards import naming
 
 TRUNK_FILE = "alexnet-owt-7be5be79.pth"
 TRUNK_URL = f"https://download.pytorch.org/models/{TRUNK_FILE}"
@@ -129,13 +130,6 @@ def find_trunk(configured: Path | None) -> Path:
 def load_lpips(configured: Path | None = None) -> LPIPS:
     """Return the LPIPS network with the trunk that :func:`find_trunk` finds."""
     path = find_trunk(configured)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # on files that it then refuses
-            trunk = torch.load(path, map_location="cpu", weights_only=True)
-        if not isinstance(trunk, dict):
-            raise ValueError(f"expected a state dict, got {type(trunk).__name__}")
+    trunk = read_tensors(path)
+    with naming(f"{path}: expected the weights of torchvision's AlexNet"):
         return LPIPS(trunk)
-    except Exception as error:  # torch.load raises many types for a damaged file
-        reason = str(error) if isinstance(error, ValueError) else "not a file of plain tensors"
-        raise ValueError(f"{path}: expected the weights of torchvision's AlexNet: {reason}") from error

@@ -18,9 +18,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dsr.degradation.downsampling import check_scale
-from dsr.methods.images import LUMA, compute_min_max, inpaint, mean3x3, normalise, upsample_bicubic
+from dsr.methods.images import LUMA, compute_min_max, grey, inpaint, mean3x3, normalise, upsample_bicubic
 from dsr.methods.networks.network import DisparityNetwork, expect_rgb_size
-from dsr.utils.compute_device import constant
 from dsr.utils.guards import expect_one_of
 
 VariantName = Literal["hui", "voynov", "dsr"]
@@ -103,8 +102,7 @@ def guidance_map(
 def intensity_of(rgb: Tensor, variant: VariantName) -> Tensor:
     """Return the intensity of an image, (B, 1, H, W) in 0..255."""
     weights, offset = _INTENSITY[variant]
-    factors = constant(weights, rgb.dtype, rgb.device)[:, None, None]
-    return ((255 * rgb * factors).sum(-3, keepdim=True) + offset).clip(0, 255)
+    return (grey(255 * rgb, weights) + offset).clip(0, 255)
 
 
 class MSGNet(DisparityNetwork):

@@ -154,8 +154,6 @@ def read_all(files: Sequence[Path], key: Key) -> tuple[list[Answers], list[str]]
 def read_answers(file: Path, key: Key) -> Answers:
     """Read one answer file; refuse one that is damaged, incomplete, of another study, or that the page cannot make."""
     try:
-        if file.stat().st_size > _LARGEST:
-            raise ValueError(f"{file}: expected a file of answers, got one of {file.stat().st_size / 1e6:.0f} MB")
         content = read_limited(file, _LARGEST).removeprefix(BOM_UTF8)
         answers = Answers.model_validate_json(content, context={"study": key.study, "page": PAGE_VERSION})
     except OSError as error:
