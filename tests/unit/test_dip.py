@@ -95,7 +95,7 @@ def test_dip_approximates_two_planes_and_the_visual_loss_gives_better_normals():
 
 @pytest.mark.parametrize("steps", [3, 150])
 def test_diverging_optimisation_ends_with_advice(steps):
-    with pytest.raises(ValueError, match=rf"step: .* diverged by step {min(steps, 100)}; a lower method.learning_rate"):
+    with pytest.raises(ValueError, match=rf"step: diverged by step {min(steps, 100)}; a lower method.learning_rate"):
         _prior(steps=steps, learning_rate=1e30)(_sample())
 
 

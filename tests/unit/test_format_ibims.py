@@ -78,7 +78,7 @@ def test_scenes_are_found_in_both_layouts_and_results_are_none(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"depth": None, "mask_transp": None}, "expected a structure data with .*, got none of depth, mask_transp"),
+        ({"depth": None, "mask_transp": None}, "expected .* in a structure data, got no depth, mask_transp"),
         ({"depth": DEPTH[1:]}, r"depth: expected shape \(480, 640\), got \(479, 640\)"),
         ({"mask_floor": ROWS[1:]}, r"mask_floor: expected shape \(480, 640\), got \(479, 640\)"),
         ({"rgb": RGB / 255}, "rgb: expected 8 bits a channel, got float64"),

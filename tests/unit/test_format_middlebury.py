@@ -94,7 +94,7 @@ def test_terraces_become_slopes_unless_requested(tmp_path, smooth):
     [
         (700, b"0", "view1.png: expected 700 x 40 pixels"),
         (370, b"many", "dmin.txt: dmin: expected a number, got many"),
-        (200, b"0", "disp1.png: expected a height near 1110, a half or a third, got 200"),
+        (200, b"0", "disp1.png: expected a height near 1110, 1/2 or 1/3, got 200"),
     ],
 )  # fmt: skip
 def test_levels_that_do_not_fit_are_refused_in_one_line(tmp_path, height, shift, message):

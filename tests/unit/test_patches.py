@@ -358,7 +358,7 @@ REFUSALS = {
         lambda: PatchData([Part(SceneList([_scene()]), share=-1.0)], _settings(), X4),
         "^share of .*, got -1.0",
     ),
-    "too few scenes": (lambda: _data(validation_scenes=6), "^validation_scenes: expected fewer than the 6 scenes"),
+    "too few scenes": (lambda: _data(validation_scenes=6), "^validation_scenes: expected less than .*'s 6 scenes"),
     "a patch in 4": (lambda: _data(patch=30), "^patch: expected a size that scale=4 divides"),
     "a patch in 16": (lambda: _data(degradation=Degradation(16, BOX), patch=24), "^patch: .*scale=16 divides, got 24"),
     "factors": (lambda: _degraded([_scene()], Everything(scales={4: 1, 16: 1}), size=24), "16"),

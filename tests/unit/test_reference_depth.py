@@ -156,7 +156,7 @@ def test_camera_of_plant_follows_from_that_of_icl_nuim():
 
 def test_scene_without_high_resolution_depth_cannot_be_resized():
     only = Scene("set", "one", torch.zeros(3, 60, 90), CAMERA, None, {2: torch.ones(1, 30, 45)})
-    with pytest.raises(ValueError, match="one: expected a high-resolution depth map to resize, there is none"):
+    with pytest.raises(ValueError, match="one: expected a true depth map to resize, there is none"):
         resize(only, 30, 45)
 
 

@@ -166,7 +166,7 @@ DAMAGE = {
     "finished: expected a time such as": changed(finished="yesterday"),
     "finished: expected a time": changed(finished="2024-05-01T12:00:00"),
     "trials: expected a valid array, got {}": changed(trials={}),
-    "incomplete, 1 of 2 scenes": changed(trials=answers("p9", "VB", "VD")["trials"][:1]),
+    "expected 2 scenes, got 1": changed(trials=answers("p9", "VB", "VD")["trials"][:1]),
     "trials.0.scene: expected one of the study's, got 's7'": changed({"scene": "s7"}),
     "different scenes, got one of them twice": changed({"scene": "s2"}),
     "order: expected each picture of the scene once": changed({"order": ["aa", "bb"]}),

@@ -127,10 +127,7 @@ class Work:
             self.process.wait()
 
     def _run(self, place: Path, before: str, *arguments: str) -> Generator[_Shown, None, str]:
-        """Run a command in a folder, and yield what it has said so far; a ValueError with its reason if it fails.
-
-        ``before`` stands above it. All that the command said is returned in the end.
-        """
+        """Run a command, and yield ``before`` and what it has said so far; a ValueError with its reason if it fails."""
         memory = free_memory()
         if self.request.max_memory is not None:
             memory = min(memory, int(1e9 * self.request.max_memory))

@@ -188,10 +188,7 @@ def _scale(settings: EvalConfig, source: SceneSource) -> float:
 
 
 def _workers(prepared: _Prepared) -> tuple[int, int]:
-    """Return how many scenes are worked on at a time, and with how many threads each.
-
-    The threads must not depend on the number of workers, which changes no bit of the results.
-    """
+    """Return how many scenes are worked on at a time, and with how many threads each."""
     settings, scenes, cores = prepared.settings, len(prepared.source.scenes()), torch.get_num_threads()
     count, threads = (None if value == "auto" else int(value) for value in (settings.workers, settings.threads))
     on_cpu = prepared.device.type == "cpu"
@@ -201,7 +198,7 @@ def _workers(prepared: _Prepared) -> tuple[int, int]:
             "start the command once per device, with the same output_dir"
         )
     together = on_cpu and not prepared.selected.recipe.abilities.optimises  # else one scene at a time has all cores
-    if threads is None:
+    if threads is None:  # does not depend on the number of workers, which changes no bit of the results
         threads = max(1, cores // max(1, scenes)) if together else cores
     if count is None:
         count = min(max(1, cores // threads), max(1, free_memory() // _MEMORY)) if together else 1

@@ -36,10 +36,7 @@ _MAIN = {
 
 
 def make_report(request: ReportRequest, console: Console) -> list[str]:
-    """Write the tables, figures, correlations and page of some runs into a directory, whole or not at all.
-
-    An earlier report in it is replaced.
-    """
+    """Write the tables, figures, correlations and page of runs in place of an earlier report, whole or not at all."""
     output = request.output
     if output.exists() and not (output.is_dir() and ((output / _MARK).is_file() or not any(output.iterdir()))):
         raise ValueError(f"{output}: expected a new directory or an earlier report, it holds something else")
@@ -75,10 +72,7 @@ def make_leaderboard(request: LeaderboardRequest, console: Console) -> list[str]
 def _write(
     folder: Path, pool: WorkerPool, study: pd.DataFrame | None, request: ReportRequest, progress: Progress
 ) -> list[str]:
-    """Write the parts, and return notes for the reader.
-
-    Workers begin with what takes them longest while the tables are written here.
-    """
+    """Write the parts, the tables while workers are at what takes longest; return notes for the reader."""
     results = pool.results
     notes: list[str] = []
     scored = any(not run.scores.empty for run in results.runs)

@@ -108,10 +108,7 @@ class Processes:
 
     @contextlib.contextmanager
     def running(self) -> Iterator[None]:
-        """Join the processes within this context; those that Lightning has started end with the first one.
-
-        The first one alone reports a mistake or an interruption.
-        """
+        """Join the processes within this context; Lightning's end with the first one, which alone reports a mistake."""
         before = {name: os.environ[name] for name in _OF_PROCESSES if name in os.environ}
         rank_zero_only.rank = self.rank  # type: ignore[attr-defined]
         if self.rank and isinstance(self.environment, environments.LightningEnvironment):

@@ -119,10 +119,7 @@ def expect_trusted(path: Path, config: Config, trust: Any, directories: Sequence
 
 @functools.cache
 def _targets_in(directory: Path) -> frozenset[tuple[str, str]]:
-    """Return the group and the target of all that a directory's files name; files outside of groups have the group "".
-
-    Methods' files are left out: a training's configuration has no method.
-    """
+    """Return group ("" outside of groups) and target of all that files name, except methods, which no training has."""
     pattern = re.compile(rf"\b(?:{'|'.join(IMPORTED)}): *([\w.]+)")
     found: set[tuple[str, str]] = set()
     for path in directory.rglob("*.yaml"):
@@ -134,10 +131,7 @@ def _targets_in(directory: Path) -> frozenset[tuple[str, str]]:
 
 
 def studies_of_run(plain: Config, given: Sequence[str]) -> Iterator[tuple[dict[str, Any], SceneSource | None]]:
-    """Yield the evaluations of ``eval.py run=RUN_DIR``: configuration and data set (None for the configuration's own).
-
-    ``given`` are the keys that the command line sets.
-    """
+    """Yield what ``eval.py run=RUN_DIR`` with ``given`` keys evaluates: settings and data set, None for their own."""
     folder = Path(plain["run"]).expanduser()
     run = read_config(folder, plain.get("trust"))
     weights = folder / WEIGHTS
@@ -152,9 +146,7 @@ def studies_of_run(plain: Config, given: Sequence[str]) -> Iterator[tuple[dict[s
     network = run["model"]["net"]
     kind = load_target("model.net", network)
     if not (isinstance(kind, type) and issubclass(kind, DisparityNetwork)):
-        raise ConfigError(
-            f"{folder / 'config.yaml'}: model.net._target_: expected a network, got {network['_target_']}"
-        )
+        raise ConfigError(f"run={folder}: model.net._target_: expected a network, got {network['_target_']}")
     method = {"model": name, **kind.method}
     if not str(network["_target_"]).startswith("dsr."):
         method["network"] = str(network["_target_"])

@@ -76,9 +76,7 @@ def load_matrices(path: Path, dataset: str, name: str) -> Scene:
     needed = ("rgb", "depth", "calib", *_VALID)
     missing = [key for key in needed if key not in stored]
     if missing:
-        raise ValueError(
-            f"{path}: expected a structure data with {', '.join(needed)}, got none of {', '.join(missing)}"
-        )
+        raise ValueError(f"{path}: expected {', '.join(needed)} in a structure data, got no {', '.join(missing)}")
     shapes = {"rgb": (*SIZE, 3), "calib": (3, 3), **dict.fromkeys(("depth", *_MASKS), SIZE)}
     for key, shape in shapes.items():
         if key in stored and stored[key].size and stored[key].shape != shape:

@@ -116,9 +116,7 @@ def load_levels(files: Files, dataset: str, name: str, year: int, *, smooth: boo
     else:
         per_pixel = round(_FULL_HEIGHT / height)
         if per_pixel not in (1, 2, 3):
-            raise ValueError(
-                f"{files.disparity}: expected a height near {_FULL_HEIGHT}, a half or a third, got {height}"
-            )
+            raise ValueError(f"{files.disparity}: expected a height near {_FULL_HEIGHT}, 1/2 or 1/3, got {height}")
         shift = _ASSUMED_SHIFT
         if files.shift is not None:
             shift = _number(files.shift, "dmin", read_text(files.shift).strip())

@@ -45,9 +45,7 @@ _TOLERANCE = 1e-5
 def resize(scene: Scene, height: int, width: int) -> Scene:
     """Return a scene at another size, its camera included; measured low-resolution maps are left out."""
     if scene.depth is None:
-        raise ValueError(
-            f"{scene.name}: expected a high-resolution depth map to resize, there is none (dataset.size=null)"
-        )
+        raise ValueError(f"{scene.name}: expected a true depth map to resize, there is none (dataset.size=null)")
     if (height, width) == (scene.camera.height, scene.camera.width):
         return replace(scene, measured={})
     photo = functional.interpolate(scene.rgb[None], (height, width), mode="bicubic", antialias=True)[0].clamp(0, 1)

@@ -28,10 +28,8 @@ class Procedural(SceneSource):
     evaluation = False
 
     def __init__(self, count: int = 200, size: int = 512, seed: int = 0) -> None:
-        if count < 1 or size < 32 or seed < 0:
-            raise ValueError(
-                f"dataset: expected count at least 1, size at least 32, seed at least 0; got {count}, {size}, {seed}"
-            )
+        if count < 1 or seed < 0:
+            raise ValueError(f"dataset: expected count at least 1 and seed at least 0, got {count} and {seed}")
         expect_room_for(size)
         self._size, self._seed = size, seed
         self._series = f"procedural-v{PROCEDURAL_VERSION}-{seed}-{size}"
@@ -46,10 +44,7 @@ class Procedural(SceneSource):
         return f"{self._series}-{scene}"
 
     def prepare(self, scenes: Sequence[str], say: Callable[[str], None] = SILENT.say) -> Iterable[str]:
-        """Render scenes that are not in the cache, and yield the name of each that is ready.
-
-        All processors take part if it takes longer than a few seconds.
-        """
+        """Render scenes that are not in the cache, with all processors if it takes long; yield each that is ready."""
         folder = cache_directory() / self._series
         missing = [scene for scene in scenes if not (folder / f"{scene}.npz").is_file()]
         yield from (scene for scene in scenes if scene not in missing)
@@ -79,8 +74,6 @@ class SimGeo(SceneSource):
     evaluation = True
 
     def __init__(self, root: str | None = None, scenes: SceneSelection = None, size: int = 512) -> None:
-        if size < 32:
-            raise ValueError(f"size: expected at least 32 pixels, got {size}")
         expect_room_for(size)
         self._size = size
         self._lucy: Folder | None = None

@@ -31,7 +31,6 @@ Frames = Mapping[str, tuple[Any, ...]]  # arguments of a function that loads a f
 # Note of a scene whose ``doffs`` is replaced by 0: z = baseline fx / d instead of baseline fx / (d + doffs)
 WITHOUT_OFFSET = "depth is not metric: the disparity offset is left out, as in the paper"
 _MOST_MISSING, _MOST_KNOWN = 30, 60  # numbers of scenes that messages name
-_MIN_SIZE = 32
 _MAX_HASHED = 1 << 28  # largest size in bytes of files whose content is hashed
 
 
@@ -165,9 +164,8 @@ class Preparation:
     fill: tuple[str, ...] = ()  # names of the scenes whose holes are inpainted
 
     def __post_init__(self) -> None:
-        if self.size is not None and self.size < _MIN_SIZE:
-            raise ValueError(f"size: expected at least {_MIN_SIZE} pixels, or null, got {self.size}")
-        expect_room_for(self.size or _MIN_SIZE)
+        if self.size is not None:
+            expect_room_for(self.size)
         if self.crop is not None and not 0 <= self.crop <= 1:
             raise ValueError(f"crop: expected a number from 0 to 1, or null, got {self.crop}")
 

@@ -69,9 +69,7 @@ def load_frame(
     ``samples_path``, which needs ``depth_range``, metres of levels 1 and 255, and has no true depth.
     """
     if intrinsics is None:
-        raise ValueError(
-            f"{path}: expected intrinsics=(fx, fy, cx, cy) beside it, as the benchmark's files hold no camera"
-        )
+        raise ValueError(f"{path}: expected intrinsics=(fx, fy, cx, cy) beside it, as the files hold no camera")
     depth = None
     if samples_path is None:
         rgb, depth, samples = read_matrices(path, variables)

@@ -65,10 +65,7 @@ def load_results(paths: Sequence[Path]) -> Results:
 
 
 def _unfit_prediction(run: Run, scene: str) -> str:
-    """Return what is wrong with the type or size of a prediction, empty for nothing; its values are not read.
-
-    A file that is damaged, or a run that stored no scene, is left to those that draw it.
-    """
+    """Return what is wrong with a prediction's type or size; nothing if it is damaged, or without a stored scene."""
     path = prediction_path(run.folder, scene)
     try:
         shape, dtype = array_headers(path)["depth"]
@@ -177,10 +174,7 @@ def _read_scores(path: Path) -> pd.DataFrame:
 
 
 def _distinguish(runs: Sequence[Run]) -> list[Run]:
-    """Append the differing settings to equal labels and data sets' names of runs.
-
-    Examples: "MSG-V (ensemble=1)", "middlebury (size=256)".
-    """
+    """Append the differing settings to equal labels and data sets' names of runs, as in "MSG-V (ensemble=1)"."""
     methods = [method_settings(run.settings) | {"alignment": run.settings.get("alignment")} for run in runs]
     for found, run in zip(methods, runs, strict=True):
         for key, name in (("weights_sha256", "weights"), ("precision", "precision")):
@@ -196,10 +190,7 @@ def _distinguish(runs: Sequence[Run]) -> list[Run]:
 
 
 def _by_truth(runs: Sequence[Run]) -> list[Run]:
-    """Mark runs that have different ground truths for the same scenes, by its hash after the data set's name.
-
-    Example: "garden (truth 5f3c01ab)".
-    """
+    """Mark data sets of runs with different truths of the same scenes by a hash, as in "garden (truth 5f3c01ab)"."""
     namesakes: dict[tuple[str, float], list[Run]] = {}
     for run in runs:
         namesakes.setdefault((run.dataset, run.scale), []).append(run)

@@ -116,10 +116,7 @@ class LPIPSv(PerImageMean):
 
 
 class SurfaceMetrics(torchmetrics.MetricCollection):
-    """A collection that makes one :class:`~dsr.metrics.functional.SurfacePair` of a batch for all of its metrics.
-
-    ``alignment`` is one of :data:`dsr.metrics.alignment.ALIGNMENTS`, of each prediction to its truth.
-    """
+    """A collection whose metrics share one :class:`~dsr.metrics.functional.SurfacePair` of a batch, perhaps aligned."""
 
     def __init__(self, *metrics: Any, alignment: str = "none", **settings: Any) -> None:
         super().__init__(*metrics, **settings)

@@ -72,10 +72,7 @@ def strongest_window(values: np.ndarray, height: int, width: int, taken: Sequenc
 
 
 def reduced(values: Tensor, longest: int) -> Tensor:
-    """Reduce (C, H, W) by averaging blocks of pixels until the longer side is at most ``longest`` pixels.
-
-    A block of which less than half is valid becomes NaN.
-    """
+    """Reduce (C, H, W) to at most ``longest`` pixels by means of blocks, NaN where less than half of one is valid."""
     factor = math.ceil(max(values.shape[-2:]) / longest)
     if factor == 1:
         return values

@@ -37,10 +37,7 @@ def fill(template: str, parts: Mapping[str, Any]) -> str:
 
 
 def policy(style: str, script: str, images: str) -> str:
-    """Return a content security policy that allows this style, this script and pictures from some sources alone.
-
-    The page cannot ask a server or send it anything (W3C "Content Security Policy Level 3").
-    """
+    """Return a policy (W3C CSP 3) that allows this style, this script and some sources of pictures, but no server."""
     own = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (style, script)]
     return (
         f"default-src 'none'; img-src {images}; style-src 'sha256-{own[0]}'; script-src 'sha256-{own[1]}'; "

@@ -140,9 +140,7 @@ def problem_data(results: Results, problem: BenchmarkSetting) -> dict[str, Any]:
             if math.isfinite(value):
                 seconds[run.label].setdefault(str(scene), []).append(float(value))
     return {
-        "dataset": problem.dataset,
-        "scale": problem.scale,
-        "downsampling": problem.downsampling,
+        **problem._asdict(),
         "methods": methods,
         "scenes": scenes,
         "means": [_row(row, facts, formats) for row in rows_of(mean, methods, runs, scores, formats)],
@@ -172,11 +170,7 @@ def run_data(run: Run) -> dict[str, Any]:
     """Return the settings and versions of a run as text by key."""
     return {
         "folder": run.folder.name,
-        "label": run.label,
-        "dataset": run.dataset,
-        "scale": run.scale,
-        "downsampling": run.downsampling,
-        "seed": run.seed,
+        **{name: getattr(run, name) for name in ("label", "dataset", "scale", "downsampling", "seed")},
         "settings": flat(run.settings),
         "versions": flat(run.versions),
     }

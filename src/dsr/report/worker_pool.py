@@ -26,10 +26,7 @@ class WorkerPool(contextlib.ExitStack):
             self._pool = self.enter_context(Pool(workers, copy, (results,), threads, say))
 
     def map(self, function: Callable[[Results, _Item], _Value], items: Sequence[_Item]) -> Generator[_Value]:
-        """Return the values of ``function(results, item)``, of a module's function, in the order of the items.
-
-        Workers begin at once; without them, each call is made when its value is asked for.
-        """
+        """Return what a module's function returns for the results and each item, in order; workers begin at once."""
         if self._pool is None:
             return (function(self.results, item) for item in items)
         return (value for _, value in self._pool.results(function, items, ordered=True))

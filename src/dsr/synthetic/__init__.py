@@ -63,7 +63,9 @@ def load_or_render(path: Path, make: Callable[[], Rendering]) -> Rendering:
 
 
 def expect_room_for(size: int) -> None:
-    """Refuse a height and width of scenes that this machine has too little memory to make."""
+    """Refuse a height and width of scenes that is too small, or that this machine has too little memory to make."""
+    if size < 32:
+        raise ValueError(f"size: expected at least 32 pixels, got {size}")
     expect_memory("size", size, _BYTES * size**2)
 
 

@@ -186,7 +186,9 @@ class PatchData(lightning.LightningDataModule):
             workers = wanted
         elif self._training_device().type != "cpu":
             devices = 1 if self.trainer is None else self.trainer.num_devices  # of this machine, a process each
-            workers = max(1, _count_cores() // devices - 1)
+            # of which a cluster's job has a part
+            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+            workers = max(1, cores // devices - 1)
         return _PatchLoader(
             self._cut,
             batch_sampler=_PatchNumbers(self.trainer, self.patches.batch),
@@ -209,11 +211,6 @@ class PatchData(lightning.LightningDataModule):
     test_dataloader = predict_dataloader = val_dataloader
 
 
-def _count_cores() -> int:
-    """Return how many cores this process may use, of which a cluster's job has a part."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def _split(source: SceneSource, settings: PatchSettings) -> tuple[list[str], list[str]]:
     """Return the scenes of a data set to train on, and the last ones, to validate with."""
     if source.evaluation:
@@ -223,17 +220,12 @@ def _split(source: SceneSource, settings: PatchSettings) -> tuple[list[str], lis
         )
     names, count = source.scenes()[: settings.scenes], settings.validation_scenes
     if len(names) <= count:
-        raise ValueError(
-            f"validation_scenes: expected fewer than the {len(names)} scenes of {source.name}, got {count}"
-        )
+        raise ValueError(f"validation_scenes: expected less than {source.name}'s {len(names)} scenes, got {count}")
     return names[: len(names) - count], names[len(names) - count :]
 
 
 class _PatchNumbers:
-    """The patch numbers of one device's batches in an epoch, from the trainer's current step on.
-
-    The length is that of the whole epoch, as Lightning subtracts the batches that were done before an interruption.
-    """
+    """The patch numbers of one device's batches in an epoch, from the trainer's current step on."""
 
     def __init__(self, trainer: lightning.Trainer | None, batch: int) -> None:
         self._trainer, self._batch = trainer, batch
@@ -244,7 +236,7 @@ class _PatchNumbers:
         self._length = self._accumulate * (steps if steps > 0 else max(1, _EPOCH // self._accumulate))
 
     def __len__(self) -> int:
-        return self._length
+        return self._length  # of the whole epoch: Lightning subtracts the batches done before an interruption
 
     def __iter__(self) -> Iterator[list[int]]:
         done = 0 if self._trainer is None else self._trainer.global_step * self._accumulate

@@ -282,9 +282,7 @@ def _read_part(path: Path, name: str, node: Mapping[str, Any]) -> Any:
     """Return a part of a module of its class and arguments in a checkpoint, which may come from somebody else."""
     target, expected = str(node.get("_target_")), _PARTS[name]
     if not target.startswith(_TRUSTED):
-        raise ValueError(
-            f"{name}: the checkpoint names {target}, which is neither dsr's nor torch.optim's; give {name}="
-        )
+        raise ValueError(f"{name}: the checkpoint names {target}, neither dsr's nor torch.optim's; give {name}=")
     kind = load_object(name, target, f"a {expected.__name__}")
     if not (isinstance(kind, type) and issubclass(kind, expected)):
         raise ValueError(f"{name}: expected a {expected.__name__} in the checkpoint, {target} is none")

@@ -114,10 +114,7 @@ class DepthObjective(Objective):
     def check(self, net: DisparityNetwork, patch: int, *, hinted: bool) -> None:
         """Refuse a network that states its errors, and patches that are too small for the visual loss."""
         if net.states_errors:
-            raise ValueError(
-                f"objective: expected {SurfaceObjective.__name__} for {type(net).__name__}, which states its errors, "
-                f"got {type(self).__name__}"
-            )
+            raise ValueError(f"objective: expected SurfaceObjective for {type(net).__name__}, got DepthObjective")
         self.visual.check_size(patch, patch)
 
     def balanced(self, first_patches: Callable[[int], Sequence[Batch]]) -> Self:
@@ -175,10 +172,7 @@ class SurfaceObjective(Objective):
         """Refuse a network that does not state its errors, and maps without hints."""
         name = type(net).__name__
         if not net.states_errors:
-            raise ValueError(
-                f"objective: expected {DepthObjective.__name__} for {name}, which states no errors, "
-                f"got {type(self).__name__}"
-            )
+            raise ValueError(f"objective: expected DepthObjective for {name}, got SurfaceObjective")
         if not hinted:
             raise ValueError(f"degradation: expected everything or another one with hints, for {name}, got plain")
 

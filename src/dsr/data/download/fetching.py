@@ -248,10 +248,7 @@ def _fetch_from(url: str, item: Item, checksums: Checksums, progress: Progress) 
 
 
 def _download(url: str, part: Path, moved: Task, room: float) -> None:
-    """Download a file, from where ``part`` ends on if the server can.
-
-    ``room`` is how much more must be free on the disk afterwards, as a multiple of the file's size.
-    """
+    """Download a file, after what ``part`` has if possible; ``room`` times its size must stay free on the disk."""
     part.parent.mkdir(parents=True, exist_ok=True)
     with requests.Session() as session:
         for scheme in ("http://", "https://"):
@@ -445,10 +442,7 @@ def _difference(name: str, checksums: Checksums, progress: Progress, pinned: str
 def _checked_hash(
     name: str, path: Path, source: str, checksums: Checksums, progress: Progress, pinned: str | None
 ) -> str:
-    """Return a file's checksum; one of another kind, or with another checksum than is known, is refused.
-
-    ``source`` is what the message calls the file.
-    """
+    """Return a file's checksum; one of another kind, or of another checksum, is refused, as ``source``."""
     with opened(path) as file:
         beginning = file.read(512)
     suffix = Path(name).suffix

@@ -303,10 +303,7 @@ def conjugate_gradients(
 
 @dataclass(eq=False)
 class ShapeFromShading(Method):
-    """Variational super-resolution from shading.
-
-    Holes of the input are inpainted. The low-resolution map is assumed to hold block means of depth.
-    """
+    """Variational super-resolution from shading, of block means of depth whose holes are inpainted."""
 
     abilities = Abilities(fast_on="cpu", cost=Cost(1300, 60))
     range_type = "orthogonal"

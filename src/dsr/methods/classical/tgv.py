@@ -69,10 +69,7 @@ class Solution(NamedTuple):
 
 @dataclass(eq=False)
 class TotalGeneralisedVariation(Method):
-    """TGV-guided upsampling.
-
-    Holes of the input are inpainted. The low-resolution map is assumed to hold block means of disparity.
-    """
+    """TGV-guided upsampling of block means of disparity whose holes are inpainted."""
 
     abilities = Abilities(ratios="whole", cost=Cost(800, 60))
 

@@ -244,9 +244,7 @@ class PriorOptimisation(lightning.LightningModule):
             named = {f"train/{name}": value.detach() for name, value in terms.items()}
             self.log_dict({"step": float(step), **named}, batch_size=1)  # else Lightning counts from 0
         if (step == self.options.steps or step % _STEPS_BETWEEN_CHECKS == 0) and not terms["loss"].isfinite():
-            raise ValueError(
-                f"{self.sample.scene}: the optimisation diverged by step {step}; a lower method.learning_rate may help"
-            )
+            raise ValueError(f"{self.sample.scene}: diverged by step {step}; a lower method.learning_rate may help")
         with torch.no_grad():
             self.average.lerp_(depth, 1 - min(self.options.average, (step - 1) / (step + 9)))
         return terms["loss"]

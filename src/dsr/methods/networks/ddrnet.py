@@ -31,10 +31,7 @@ class DDRNet(NormalisedNetwork):
         super().__init__()
         check_scale(scale)
         if denoising < 1 or refinement < 4 or refinement % 4:
-            raise ValueError(
-                f"model: expected denoising of at least 1 and refinement a positive multiple of 4, "
-                f"got {denoising} and {refinement}"
-            )
+            raise ValueError(f"model: expected denoising from 1, refinement 4, 8, ..., got {denoising}, {refinement}")
         self.scale, self.denoising, self.refinement = scale, denoising, refinement
         halvings = min(_HALVINGS, scale.bit_length() - 1)
         self.denoise = Denoising(denoising, halvings)
@@ -57,10 +54,7 @@ class DDRNet(NormalisedNetwork):
 
 
 class Denoising(nn.Module):
-    """The denoising network: a U-net whose coarsest level has residual blocks; its channels double with each halving.
-
-    ``radius`` is that of the receptive field in pixels of the map.
-    """
+    """Denoising: a U-net whose coarsest level has residual blocks; its channels double with each halving."""
 
     def __init__(self, width: int, halvings: int) -> None:
         super().__init__()
@@ -73,6 +67,7 @@ class Denoising(nn.Module):
         )
         self.last = nn.Conv2d(2 * width, 1, 3, padding=1)
         coarsest = 2**halvings
+        # of the receptive field in pixels of the map
         self.radius = 2 + (coarsest - 1) + 2 * _BLOCKS * coarsest + 2 * (coarsest - 1)
         _initialise(self, self.last)
 
@@ -91,10 +86,7 @@ class Denoising(nn.Module):
 
 
 class Refinement(nn.Module):
-    """The refinement network: features of depth and intensity at three sizes, brought to the first (*hypercolumns*).
-
-    ``radius`` is that of the receptive field in pixels of the map: of convolutions, pooling and enlargement.
-    """
+    """The refinement network: features of depth and intensity at three sizes, brought to the first (*hypercolumns*)."""
 
     def __init__(self, width: int, halvings: int) -> None:
         super().__init__()
@@ -102,7 +94,7 @@ class Refinement(nn.Module):
         self.joined = nn.Conv2d(width, width, 3, padding=1)
         self.levels = nn.ModuleList()
         before, columns = 2 * width, width
-        self.radius = 2 + 2 * 2**halvings - 1
+        self.radius = 2 + 2 * 2**halvings - 1  # of the receptive field: of convolutions, pooling and enlargement
         for level in range(1, halvings + 1):
             after = width * 2**level
             layers = [nn.Conv2d(n, after, 3, padding=1) for n in (before, *[after] * level)]

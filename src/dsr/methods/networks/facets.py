@@ -21,6 +21,7 @@ from dsr.methods.images import exporting, pad_to_multiple
 from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, mix_planes, stencil
 from dsr.methods.networks.network import NormalisedNetwork
 from dsr.utils.compute_device import constant
+from dsr.utils.guards import expect_positive
 
 FULL, HALF = 16, 32  # channels of the photo's features at the full and at half the resolution
 HEAD = 24  # channels of the layers that choose the planes, at the full resolution
@@ -36,10 +37,8 @@ class Facets(NormalisedNetwork):
     def __init__(self, scale: int, width: int = 96, blocks: int = 6, facets: int = 2, *, slopes: bool = True) -> None:
         super().__init__()
         check_scale(scale)
-        if min(width, facets) < 1 or blocks < 0:
-            raise ValueError(
-                f"model: expected width and facets of at least 1, blocks of at least 0; got {width}, {facets}, {blocks}"
-            )
+        expect_positive(width=width, facets=facets)
+        expect_positive(or_zero=True, blocks=blocks)
         self.scale, self.width, self.blocks, self.facets, self.slopes = scale, width, blocks, facets, slopes
         # of each residual block 2; 1 of the neighbours' planes, 3 convolutions, 2 of the differences
         self.receptive_field_radius = 2 * blocks + 6

@@ -90,9 +90,7 @@ class AnyMap(Method):
                 path, self._caution = special, caution
             net = load_network(path, networks, None, model)
             if not isinstance(net, FacetsUNet):
-                raise ValueError(
-                    f"{path}: expected weights of {FacetsUNet.__name__}, got those of {type(net).__name__}"
-                )
+                raise ValueError(f"{path}: expected weights of FacetsUNet, got those of {type(net).__name__}")
             weights = net.eval().requires_grad_(False).to(DTYPES[precision])
         self._max_error = max_error
         self._net = weights.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs

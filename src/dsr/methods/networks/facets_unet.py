@@ -36,6 +36,7 @@ from dsr.methods.networks.facets import (
 from dsr.methods.networks.facets_planes import NEIGHBOURS, Stencil, average_planes, mix_planes, smooth, stencil
 from dsr.methods.networks.network import Answer, DisparityNetwork, expect_rgb_size
 from dsr.utils.compute_device import constant
+from dsr.utils.guards import expect_positive
 from dsr.utils.progress import Steps
 
 # layers at the low resolution
@@ -70,11 +71,9 @@ class FacetsUNet(DisparityNetwork):
         super().__init__()
         if scale not in (1, 2, 4, 8, 16):
             raise ValueError(f"scale: expected 1, 2, 4, 8 or 16, got {scale}")
-        if min(width, deep, facets) < 1 or blocks < _BEFORE:
-            raise ValueError(
-                f"model: expected positive sizes and blocks of at least {_BEFORE}, got width {width}, deep {deep}, "
-                f"facets {facets}, blocks {blocks}"
-            )
+        expect_positive(width=width, deep=deep, facets=facets)
+        if blocks < _BEFORE:
+            raise ValueError(f"blocks: expected at least {_BEFORE}, got {blocks}")
         self.scale, self.width, self.deep, self.blocks, self.facets = scale, width, deep, blocks, facets
         levels = max(scale, 2).bit_length() - 1
         inputs = 4 + 3 * (levels == 1)

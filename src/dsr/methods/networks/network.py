@@ -78,10 +78,7 @@ class DisparityNetwork(nn.Module, abc.ABC):
             )
         shapes = [{name: value.shape for name, value in net.state_dict().items()} for net in (self, first)]
         if shapes[0] != shapes[1]:
-            raise ValueError(
-                f"weights are for scale {first.scale}, the run is at scale {self.scale}, where {type(self).__name__} "
-                "has other parameters"
-            )
+            raise ValueError(f"weights are for scale {first.scale}, the run is at scale {self.scale}")
         self.load_state_dict(first.state_dict())
 
     def share(self, first: DisparityNetwork) -> None:

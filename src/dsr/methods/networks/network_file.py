@@ -229,10 +229,7 @@ def write_onnx(path: Path, graph: OnnxGraph, facts: Mapping[str, Any]) -> float:
             differences.append((torch.from_numpy(mine) - theirs).abs().max() / value_range)
         difference = float(torch.stack(differences).max())
         if not difference <= _TOLERANCE:
-            raise ValueError(
-                f"{path}: expected the network's results to {_TOLERANCE:g} of the range, got a difference of "
-                f"{difference:g}"
-            )
+            raise ValueError(f"{path}: expected results within {_TOLERANCE:g} of the range, got {difference:g}")
     return difference
 
 

@@ -191,9 +191,7 @@ def _expect_all(file: Path, given: Sequence[Answer], key: Key) -> None:
     for scenes, number, what in ((fresh, key.scenes_per_person, "scenes"), (again, key.repeat, "repeated scenes")):
         if len(set(scenes)) != len(scenes):
             raise ValueError(f"{file}: expected {number} different {what}, got one of them twice")
-        if len(scenes) < number:
-            raise ValueError(f"{file}: incomplete, {len(scenes)} of {number} {what}")
-        if len(scenes) > number:
+        if len(scenes) != number:
             raise ValueError(f"{file}: expected {number} {what}, got {len(scenes)}")
     if not set(again) <= set(fresh):
         raise ValueError(f"{file}: expected repeated scenes that were asked before, got others")

@@ -112,10 +112,7 @@ def _rows(ballots: pd.DataFrame, place: tuple[Any, ...]) -> list[dict[str, Any]]
 
 
 def tables_of(collected: pd.DataFrame) -> Iterator[Table]:
-    """Yield a table per data set, scale and degradation, and one over all data sets if there are several.
-
-    The largest percentage of each scene is bold.
-    """
+    """Yield a table per data set, scale and degradation, and one over several data sets; the largest is bold."""
     for (dataset, scale, downsampling), rows in collected.groupby(["dataset", "scale", "downsampling"], sort=False):
         others = collected[(collected["scale"] == scale) & (collected["downsampling"] == downsampling)]
         if dataset == ALL and others["dataset"].nunique() <= 2:

@@ -110,10 +110,7 @@ def _select(results: Results, choice: Choice) -> Results:
 def _questions(
     results: Results, choice: Choice, progress: Progress, notes: list[str]
 ) -> tuple[list[dict[str, Any]], dict[str, Trial]]:
-    """Return the scenes of the page, ordered by id, and the trials of the key; ``notes`` takes what is left out.
-
-    Ids are hashes of pictures, so neither the ids nor the order on the page reveal a name.
-    """
+    """Return the page's scenes by ids, which reveal no name, and the key's trials; ``notes`` takes what is left out."""
     views = [view for problem in results.problems() for view in views_of(results, problem)]
     views = [view for view in views if not choice.scenes or view.scene in choice.scenes]
     scenes: list[dict[str, Any]] = []
@@ -139,10 +136,7 @@ def _questions(
 
 
 def _draw(view: View, light: str, notes: list[str]) -> tuple[bytes, tuple[int, int], list[tuple[Run, bytes]]] | None:
-    """Draw the ground truth, of a width and height, and each run's result as PNG.
-
-    It is None for a scene that cannot be a question; ``notes`` takes the reason.
-    """
+    """Draw the truth, of a width and height, and each run's result as PNG; None, with a note, if it is no question."""
     if len(view.runs) < _FEWEST:
         notes.append(f"left out: {view}: only {view.runs[0].label} has a prediction of it")
         return None

@@ -216,10 +216,7 @@ class Blobs(NamedTuple):
 
 
 def polygonise(field: Blobs, cells: int) -> Shape:
-    """Return the zero set of a field, standing on z = 0, with exact vertices and normals.
-
-    The longest side has about ``cells`` cells.
-    """
+    """Return the zero set of a field on z = 0, its longest side ``cells`` cells, with exact vertices and normals."""
     centres, radii, weights, waves, phases, heights, _ = field
     low, high = (centres - 1.9 * radii).min(0), (centres + 1.9 * radii).max(0)
     step = (high - low).max() / cells

@@ -30,10 +30,7 @@ _UNUSED = re.compile(r"^(PAI_\d\.(upconv\d|fusion2Depth)|conv_(depth|rgb)_mappin
 
 
 class PGSR(PeerNetwork):
-    """PGSR with its authors' sizes: 32 features, 0.73 million parameters.
-
-    Its attention averages over the whole image, so there are no tiles. Only the last layers are computed in strips.
-    """
+    """PGSR with 32 features, 0.73 million parameters; it sees the whole image, so only its last layers use strips."""
 
     title = "PGSR"
     checksums = MappingProxyType({"4e652c04c6523058": 4, "0774dd5c80ddc29a": 8, "ea327e3050228fb5": 16})
