@@ -48,10 +48,7 @@ def read_millimetres(path: Path) -> Tensor:
 
 
 def to_depth(path: Path, values: np.ndarray, farthest: float = math.inf) -> Tensor:
-    """Return depth with its holes marked, (1, H, W) float64 in metres, of values (H, W) in metres, 0 in holes.
-
-    What lies beyond ``farthest``, the sky, becomes a hole. ``path`` is for the message.
-    """
+    """Return depth, (1, H, W) float64 in metres, NaN where values, (H, W), are 0 or beyond ``farthest``, the sky."""
     with np.errstate(invalid="ignore"):  # damaged bytes may be signalling NaN, which a cast warns of
         values = values.astype(np.float64)
     if not (values >= 0).all():

@@ -60,10 +60,7 @@ class SceneSource:
         return self.fingerprint(scene)
 
     def prepare(self, scenes: Sequence[str], say: Callable[[str], None]) -> Iterable[str] | None:
-        """Prepare scenes, several at a time, and yield the name of each that is ready; ``say`` shows a line of text.
-
-        None where scenes need no preparation.
-        """
+        """Prepare scenes, several at a time, and yield the name of each that is ready; None if none needs it."""
         return None
 
 
@@ -249,10 +246,7 @@ class PreparedDataset(SceneSource):
         return digest.hexdigest()
 
     def prepare(self, scenes: Sequence[str], _: Callable[[str], None] = SILENT.say) -> Iterator[str]:
-        """Prepare scenes that are not in the cache, several at a time, and yield the name of each that is ready.
-
-        The name of a scene that fails is yielded, too; loading the scene raises the error.
-        """
+        """Prepare scenes that are not in the cache, several at a time, and yield each that is ready, or fails."""
         with ThreadPoolExecutor(min(len(scenes), os.cpu_count() or 1) or 1) as pool:
             missing = []
             for scene in scenes if self._preparation.size is not None else ():

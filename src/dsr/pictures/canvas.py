@@ -147,10 +147,7 @@ class Panels(Canvas):
 
 
 def save_both(folder: Path, name: str, figure: Figure) -> list[Path]:
-    """Write a figure as PDF and PNG atomically, and return the files.
-
-    In the PDF text is stored as text, and pictures are stored one by one, not resampled.
-    """
+    """Write a figure as PNG, and as PDF with text as text and pictures not resampled, atomically; return the files."""
     paths = []
     for suffix, interpolation, metadata in ((".pdf", "none", {"CreationDate": None}), (".png", "auto", {})):
         for axes in figure.axes:

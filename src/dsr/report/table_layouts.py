@@ -125,10 +125,7 @@ def to_markdown(table: PaperTable) -> str:
 
 
 def to_csv(table: PaperTable) -> str:
-    """Format a table as CSV at full precision, in the paper's units: one row per method and scene or average.
-
-    Missing values are empty; columns without any value (spread, interval, paper) are left out.
-    """
+    """Format a table as CSV at full precision, in the paper's units: a row per method and scene; no empty columns."""
     rows = [
         {fact.name: fact.value(row) for fact in FACTS}
         | {name: value for key, column in table.columns.items() for name, value in _values(key, column, row)}

@@ -43,10 +43,7 @@ class Rendering:
 
 
 def load_or_render(path: Path, make: Callable[[], Rendering]) -> Rendering:
-    """Return the rendering at ``path`` in the cache directory; if there is none, make it and store it there.
-
-    A damaged file is replaced, with a note. If the cache cannot be written, the rendering is made each time.
-    """
+    """Return the rendering at ``path`` in the cache directory; make it if it lacks or is damaged, and store it."""
     path = cache_directory() / path
     try:
         kept = read_arrays(path)
