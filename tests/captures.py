@@ -618,7 +618,7 @@ def depth_message(kind, **values):
     return struct.pack(">II", len(unit) + 4, len(unit)) + unit
 
 
-def heic(path, levels, message=None, text="", orientation=1, reported=None):
+def heic(path, levels, message=None, text="", orientation=1):
     """Write a HEIC photo with a depth map as iPhones do: a file of two pictures, the second of which is made auxiliary.
 
     Args:
@@ -626,7 +626,6 @@ def heic(path, levels, message=None, text="", orientation=1, reported=None):
         message: of the map; None for disparity from 0.5 to 2.
         text: XMP of the map.
         orientation: EXIF orientation, by which readers of HEIC turn both.
-        reported: what the EXIF data say in its place, which readers of HEIC leave alone.
 
     """
     import pillow_heif  # noqa: PLC0415 - an extra
@@ -640,9 +639,6 @@ def heic(path, levels, message=None, text="", orientation=1, reported=None):
     path.parent.mkdir(parents=True, exist_ok=True)
     file.save(path, quality=-1, chroma=444, exif=exif.tobytes())
     content = path.read_bytes()
-    if reported is not None:
-        entry = struct.pack(">HHI", 0x0112, 3, 1)
-        content = content.replace(entry + struct.pack(">H", orientation), entry + struct.pack(">H", reported))
 
     def box(kind, *parts):
         body = b"".join(parts)

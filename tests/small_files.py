@@ -16,6 +16,13 @@ def written(path: Path, content: bytes) -> Path:
     return path
 
 
+def touch(folder: Path, *names: str) -> Path:
+    """Make empty files."""
+    for name in names:
+        written(folder / name, b"")
+    return folder
+
+
 def encoded_png(pixels: np.ndarray) -> bytes:
     """Return a PNG file of OpenCV's."""
     return cv2.imencode(".png", pixels)[1].tobytes()

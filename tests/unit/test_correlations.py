@@ -10,8 +10,7 @@ from scipy.stats import bootstrap, permutation_test
 from small_runs import made_up_run
 
 from dsr.evaluation.results import Results
-from dsr.report import correlations
-from dsr.report.correlations import correlate, metric_matrix, save_scatter_matrix, with_reference, write_correlations
+from dsr.report.correlations import correlate, metric_matrix, with_reference, write_correlations
 from dsr.report.paper import published
 from dsr.report.significance import interval_of_mean, p_of_difference
 
@@ -71,15 +70,6 @@ def test_metrics_are_ordered_by_rank_correlation_with_lpips_without_its_own_vari
     assert row["pearson"] == pytest.approx(stats.pearsonr(matrix["DSSIM_v[e2]"], matrix["LPIPS_v"]).statistic)
 
 
-def test_correlation_files_hold_the_tables(tmp_path):
-    paths = write_correlations(tmp_path, RESULTS)
-    assert [path.name for path in paths] == [
-        "pearson.csv", "spearman.csv", "pairs.csv", "with_lpips.csv", "with_lpips.md"]  # fmt: skip
-    again = pd.read_csv(paths[1], index_col="metric")
-    pd.testing.assert_frame_equal(again, correlate(metric_matrix(RESULTS), "spearman"), check_names=False)
-    assert "| metric" in paths[-1].read_text(encoding="utf-8")
-
-
 def test_correlations_in_the_papers_tables_stand_beside_ours(tmp_path):
     ranking = pd.read_csv(write_correlations(tmp_path, RESULTS)[-2], index_col="metric")
     paper = published()[~published()["scene"].str.startswith("Average")]
@@ -89,17 +79,6 @@ def test_correlations_in_the_papers_tables_stand_beside_ours(tmp_path):
     depth = stats.pearsonr(paper["RMSE_d"].clip(upper=500), paper["LPIPS_v"]).statistic
     assert ranking.loc["RMSE_d", "paper_pearson"] == pytest.approx(depth)
     assert math.isnan(ranking.loc["DSSIM_v[e2]", "paper_pearson"])
-
-
-def test_missing_lpips_leaves_the_rest_and_one_line_says_so(tmp_path, monkeypatch):
-    results = Results((run("A", 5, lpips=False),))
-    text = write_correlations(tmp_path, results)[-1].read_text(encoding="utf-8")
-    assert "There is no LPIPS_v in these 5 results" in text
-    drawn = {}
-    monkeypatch.setattr(correlations, "write_figure", lambda path, figure, *_: drawn.update({path.name: figure}))
-    save_scatter_matrix(results, tmp_path)
-    assert list(drawn) == ["scatter_matrix.pdf", "scatter_matrix.png"]
-    assert "no LPIPS_v in these results" in drawn["scatter_matrix.pdf"].texts[0].get_text()
 
 
 def test_interval_of_many_scenes_is_that_of_another_bootstrap():

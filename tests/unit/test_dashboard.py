@@ -1,13 +1,10 @@
 """The TensorBoard log of an evaluation: what it holds, read back by TensorBoard's own reader."""
 
-import json
-
 import cv2
 import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensorboard.plugins.hparams import plugin_data_pb2
 
 from dsr.evaluation.results import sample_path
 from dsr.evaluation.run_files import load_results, read_run
@@ -45,19 +42,6 @@ def test_scalars_are_the_scores_in_table_units(log, tmp_path):
     }
     mean = 1000 * (scores["RMSE_v", "", "a"] + scores["RMSE_v", "", "b"]) / 2
     assert scalars(log, "score/RMSE_v") == {0: pytest.approx(mean)}
-
-
-def test_table_of_runs_has_the_columns_of_all_kinds_of_runs(make_run, tmp_path):
-    folder = make_run(tmp_path, scenes=("s",), scale=2)
-    versions = json.loads((folder / "versions.json").read_text())
-    versions["identity"]["method"] |= {"steps": 600, "w": 1.5, "widths": [1, 2], "_target_": "dsr.x"}
-    (folder / "versions.json").write_text(json.dumps(versions))
-    save_dashboard(read_run(folder))
-    content = read(folder).SummaryMetadata("_hparams_/session_start_info").plugin_data.content
-    start = plugin_data_pb2.HParamsPluginData.FromString(content).session_start_info
-    values = {key: value.string_value or value.number_value for key, value in start.hparams.items()}
-    assert values == {"method": "Bicubic", "scale": 2, "w": "1.5", "dataset": "simgeo", "degradation": "box", "seed": 0,
-                      "steps": "600", "kind": "evaluation"}  # fmt: skip
 
 
 def test_picture_has_renderings_of_the_result_above_those_of_the_truth(log, tmp_path):

@@ -4,25 +4,17 @@ import re
 import struct
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from data_set_files import LEVELS, VGA, dpt, npy, opened, ramp, rays, turned, write_frame
-from PIL import Image
 from refusals import refused
 from small_files import encoded_png as png
-from small_files import png_by_its_specification, written
+from small_files import png_by_its_specification, touch, written
 
 from dsr.data import arkitscenes, icl, sintel, sunrgbd, tartanair
 from dsr.data.eight_bit import EightBit
-from dsr.degradation.downsampling import Downsampling, make_sample
 from dsr.geometry.camera import to_range
-
-
-def touch(root, *names):
-    for name in names:
-        written(root / name, b"")
 
 
 def test_uncertain_pixels_of_the_lidar_become_holes(tmp_path, capfd):
@@ -168,24 +160,6 @@ def test_16_bit_picture_of_icl_keeps_its_values(tmp_path):
     torch.testing.assert_close(rgb[:, 5, 6], torch.tensor([1, 257 / 65535, 1 / 65535]))
 
 
-def test_office_ceiling_is_flat_in_orthogonal_depth(shared):
-    frames = icl.find_frames(shared / "real/icl_nuim")
-    assert list(frames) == ["living", "office/0000"]
-    scene = icl.load_frame(*frames["office/0000"], "icl_nuim", "office/0000")
-    orthogonal = scene.depth[0, :120, :560]
-    along = orthogonal * scene.camera.ray_lengths()[:120, :560]
-
-    def bend(depth):
-        """Return how far the depth lies from a plane, 1/z = a u + b v + c, in metres (root mean square)."""
-        known = torch.ones_like(depth).nonzero().double()
-        system = torch.column_stack((known, torch.ones(len(known))))
-        plane = torch.linalg.lstsq(system, depth.reciprocal().reshape(-1, 1)).solution
-        return ((system @ plane).reciprocal()[:, 0] - depth.reshape(-1)).square().mean().sqrt().item()
-
-    assert bend(orthogonal) < 0.01
-    assert bend(along) > 5 * bend(orthogonal)
-
-
 @pytest.mark.parametrize(("dataset", "near", "far"), [("lu", 0.7955, 3.5), ("middlebury8", 1.3152, 2.992)])
 def test_disparity_and_unit_of_8_bit_benchmarks_are_the_level(tmp_path, dataset, near, far):
     levels = LEVELS.copy()
@@ -199,19 +173,6 @@ def test_disparity_and_unit_of_8_bit_benchmarks_are_the_level(tmp_path, dataset,
     for found in (to_range(scene.depth, scene.camera, "disparity"), scene.unit.convert(scene.depth)):
         np.testing.assert_allclose(found[0], levels, rtol=0, atol=1e-10)
     assert (scene.depth.min().item(), scene.depth.max().item()) == pytest.approx((near, far), abs=1e-4)
-
-
-@pytest.mark.parametrize(("scale", "expected"), [(4, 2.4185), (8, 4.5383)])
-def test_bicubic_row_of_the_field_comes_out_on_lu(shared, scale, expected):
-    data = EightBit(str(shared / "modern/Lu"), "lu")
-    errors = []
-    for name in data.scenes():
-        sample = make_sample(data.load(name), scale, Downsampling("bicubic"), "disparity")
-        width, height = sample.camera.width, sample.camera.height
-        levels_lr = Image.fromarray(sample.disparity_lr()[0].float().numpy())
-        levels = np.asarray(levels_lr.resize((width, height), Image.Resampling.BICUBIC)).clip(0, 255)
-        errors.append(np.sqrt(np.mean((levels - sample.unit.convert(sample.depth)[0].numpy()) ** 2)))
-    assert np.mean(errors) == pytest.approx(expected, abs=1e-3)
 
 
 def test_depth_of_sun_rgbd_is_the_sensors_or_the_refined_one_of_one_picture_each(tmp_path, capfd):
@@ -245,35 +206,3 @@ def test_folder_of_sun_rgbd_without_intrinsics_needs_given_ones(tmp_path, capfd)
     assert opened(kind, tmp_path, intrinsics=(300, 301, 1, 2)).load(kind.name).camera.cy == 2
     data = opened(kind, tmp_path, intrinsics=(300, 301, 1, 2000))
     assert "expected " in refused(lambda: data.load(kind.name), "intrinsics", capfd)
-
-
-def test_real_scenes_are_read_and_the_refined_depth_agrees_where_both_are_known(shared):
-    frames = sunrgbd.find_frames(shared / "real/sunrgbd")
-    assert list(frames) == ["2014-12-18_11-31-54_260595134347", "img_0063"]
-    for name, arguments in frames.items():
-        raw = sunrgbd.load_frame(*arguments, "sunrgbd", name)
-        refined = sunrgbd.load_frame(*arguments, "sunrgbd", name, refined=True)
-        assert 0.1 < raw.depth.isnan().double().mean() < 0.4
-        assert not refined.depth.isnan().any()
-        assert (raw.depth - refined.depth).abs().nanmedian() < 0.01
-
-
-def test_nyu_crop_starts_at_column_40_and_row_44_as_its_intrinsics_say(shared):
-    folder = shared / "real/sunrgbd/img_0063"
-    full, cut = (cv2.imread(str(folder / part / "img_0063.jpg")) for part in ("fullres", "image"))
-    _, _, best, _ = cv2.minMaxLoc(cv2.matchTemplate(full, cut, cv2.TM_SQDIFF))
-    assert best == (40, 44)
-    _, _, cx, _, _, cy, *_ = map(float, (folder / "fullres/intrinsics.txt").read_text().split())
-    camera = sunrgbd.load_frame(folder, "sunrgbd", "a").camera
-    counted_from_0 = cx - 1, cy - 1
-    assert (counted_from_0[0] - best[0], counted_from_0[1] - best[1]) == pytest.approx((camera.cx, camera.cy))
-
-
-def test_scenes_behind_links_are_found_and_circular_links_are_harmless(tmp_path):
-    for part in ("image", "depth"):
-        (tmp_path / "elsewhere" / "one" / part).mkdir(parents=True)
-    root = tmp_path / "root"
-    root.mkdir()
-    (root / "linked").symlink_to(tmp_path / "elsewhere")
-    (tmp_path / "elsewhere" / "back").symlink_to(root)
-    assert list(sunrgbd.find_frames(root)) == ["linked/one"]

@@ -10,6 +10,7 @@ from small_files import encoded_png as png
 from small_files import written
 
 from dsr.data import hammer
+from dsr.data.cleargrasp import ClearGrasp
 from dsr.data.ddrnet_frames import DDRNetFrames
 from dsr.data.detection import find_scenes
 from dsr.data.eight_bit import NOTE, EightBit
@@ -19,6 +20,7 @@ from dsr.data.middlebury import Middlebury, MiddleburyLevels
 from dsr.data.nyu import NYU
 from dsr.data.rgbdd import RGBDD, find_frames
 from dsr.data.sintel import Sintel
+from dsr.data.stereo_board import StereoBoard
 from dsr.data.sunrgbd import SunRGBD
 from dsr.data.tartanair import TartanAir
 from dsr.data.tofmark import ToFMark
@@ -163,6 +165,8 @@ REAL = [
     (DDRNetFrames, "real/ddrnet", {}, 6, "frame_000001", (480, 640), [1.355, 1.353]),
     (RGBDD, "modern/RGBDD", {"real": False}, 21, "20200509112638", (384, 512), [1.728]),
     (RGBDD, "real/rgbdd_real", {"real": True}, 2, "20200509112638", (384, 512), [1.728, 1.745]),
+    (ClearGrasp, "real/cleargrasp", {"synthetic": False}, 2, "080", (720, 1280), [0.599, 0.619]),
+    (StereoBoard, "real/stereo_board", {}, 5, "14", (1080, 1920), [1.206, 1.036]),
     (NYU, "modern/NYU", {"split": "test"}, 3, "1001", (480, 640), [2.962]),
     (Middlebury, "real/middlebury2014", {"size": None}, 10, "artl", (277, 347), [1.776]),
     (MiddleburyLevels, "real/middlebury2006", {"year": 2006, "size": None}, 8, "aloe", (370, 427), [2.308]),

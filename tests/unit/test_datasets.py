@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from small_files import touch
 
 from dsr.data.middlebury import EVALUATION_2014, TRAINING, Middlebury, MiddleburyLevels, MiddleburyTrain
 from dsr.data.rendered import Procedural, SimGeo
@@ -18,16 +19,8 @@ from dsr.utils.configuration import ConfigError, build
 CONF = Path(__file__).resolve().parents[2] / "conf" / "dataset"
 
 
-def touch(root, *paths):
-    """Make empty files."""
-    for path in paths:
-        (root / path).parent.mkdir(parents=True, exist_ok=True)
-        (root / path).touch()
-    return str(root)
-
-
 def stereo_2014(root, names):
-    return touch(root, *(f"{name.title()}-perfect/calib.txt" for name in names))
+    return str(touch(root, *(f"{name.title()}-perfect/calib.txt" for name in names)))
 
 
 def node(name):
@@ -62,8 +55,8 @@ def test_dataset_configurations_build_their_classes(name, tmp_path, monkeypatch)
 
 
 def test_frames_can_be_chosen_in_the_configuration(tmp_path):
-    root = touch(tmp_path, *(f"{where}/{what}/{number}.png" for where in ("x", "y") for what in ("rgb", "depth")
-                             for number in (0, 7)))  # fmt: skip
+    root = str(touch(tmp_path, *(f"{where}/{what}/{number}.png" for where in ("x", "y") for what in ("rgb", "depth")
+                                 for number in (0, 7))))  # fmt: skip
     entries = {**node("icl"), "root": root, "frames": {**ICL_FRAMES, "sofa": "y/0007"}, "scenes": ["sofa", "x_0000"]}
     assert build("dataset", entries).scenes() == ["sofa", "x_0000"]
     with pytest.raises(ConfigError, match="got 1 of 6 scenes"):  # the others are not those of the paper
@@ -77,10 +70,10 @@ def test_sun_rgbd_scenes_are_found_below_any_folder_by_path_or_prefix(tmp_path):
     root = touch(tmp_path, *(f"SUNRGBD/{path}/{part}/x" for path in paths for part in ("image", "depth")),
                  "SUNRGBD/xtion/sun3ddata/brown_bm_2/brown_bm_2/a/image/x",
                  "SUNRGBD/xtion/sun3ddata/brown_bm_2/brown_bm_2/a/depth/x")  # fmt: skip
-    data = SunRGBD(root, frames=SUN_FRAMES)
+    data = SunRGBD(str(root), frames=SUN_FRAMES)
     assert data.scenes() == list(SUN_FRAMES)
     assert "brown_bm_2_a" in data._found["xtion_3"].files[0].as_posix().replace("/", "_")
-    assert len(SunRGBD(root, "found", frames=SUN_FRAMES).scenes()) == 14
+    assert len(SunRGBD(str(root), "found", frames=SUN_FRAMES).scenes()) == 14
 
 
 def test_middlebury_has_the_scenes_of_the_paper_and_none_of_them_is_trained_on(tmp_path):

@@ -23,7 +23,6 @@ from dsr.degradation.holes import Blobs, Shadows
 from dsr.degradation.noise import GaussianMultiplicative, Kinect, TimeOfFlight
 from dsr.degradation.random_degradation import Everything
 from dsr.inference import upsample_surface
-from dsr.methods.dip.upsampler import DeepImagePrior, PriorOptimisation
 from dsr.methods.networks.facets_unet import FacetsUNet
 from dsr.methods.networks.msg_net import MSGNet
 from dsr.metrics import evalmde
@@ -36,7 +35,7 @@ from dsr.training.module import SuperResolution
 from dsr.training.objective import DepthObjective, SurfaceObjective
 from dsr.training.patches import Patches
 from dsr.training.settings import PatchSettings
-from dsr.utils.compute_device import fast_precision, in_own_precision, pick_device
+from dsr.utils.compute_device import in_own_precision, pick_device
 from dsr.utils.configuration import ConfigError
 
 METHODS = [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in AT_HAND]
@@ -182,33 +181,6 @@ def test_step_of_facets_waits_for_no_gpu_and_takes_as_many_operations_for_any_ba
     assert counts[1] < 1500
 
 
-def test_step_of_a_deep_image_prior_waits_for_no_gpu():
-    with pretend_cuda() as gpu:
-        sample = _sample()
-        options = DeepImagePrior(scale=4, downsampling=Downsampling("box"), widths=[4] * 5, device=gpu)
-        module = PriorOptimisation(options, sample, visual=True)
-        optimizer = module.configure_optimizers()
-        for warm in (False, True):
-            operations = _Operations()
-            with operations if warm else contextlib.nullcontext():
-                module.loss_terms(*module())["loss"].backward()
-                optimizer.step()
-                optimizer.zero_grad()
-    assert operations.waits == []
-    assert operations.count < 500
-
-
-def test_inference_of_facets_asks_a_gpu_once_whether_there_are_holes():
-    with pretend_cuda() as gpu, torch.no_grad():
-        net = FacetsUNet(4, width=8, deep=8).eval().to(gpu)
-        rgb, disparity = torch.rand(1, 3, 128, 128, device=gpu), 1 + torch.rand(1, 1, 32, 32, device=gpu)
-        net.answer(rgb, disparity)
-        with _Operations() as operations:
-            net.answer(rgb, disparity)
-    assert operations.waits == ["_local_scalar_dense"]
-    assert operations.count < 700
-
-
 @pytest.mark.parametrize(("net", "breaks"), [(MSGNet, 0), pytest.param(FacetsUNet, 1, marks=pytest.mark.nightly)])
 @pytest.mark.filterwarnings("ignore")
 def test_network_is_one_graph_beside_what_differs_from_step_to_step(net, breaks):
@@ -307,12 +279,3 @@ def test_what_a_device_cannot_compute_is_refused(name, precision, error):
 def test_device_that_this_machine_lacks_is_refused(name):
     with pytest.raises(ConfigError, match=r"^device: expected auto, cpu or a device of this machine, got "):
         pick_device(name)
-
-
-@pytest.mark.parametrize(
-    ("avx", "amx", "expected"), [(False, False, "float32"), (True, False, "bfloat16"), (True, True, "bfloat16")]
-)
-def test_fast_precision_of_a_cpu_is_what_it_has_instructions_for(monkeypatch, avx, amx, expected):
-    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: avx)
-    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx)
-    assert fast_precision(CPU) == expected

@@ -19,7 +19,7 @@ from small_files import written
 
 from dsr.cli import main
 from dsr.data.download import CATALOGUE, Collection, Item
-from dsr.data.download.fetching import Checksums, checksums_of, get, lock_directory, state, verify
+from dsr.data.download.fetching import Checksums, get, lock_directory, state, verify
 from dsr.utils.progress import Progress
 
 OTHER = b"\x89PNG\r\n\x1a\n" + bytes(range(255, -1, -1)) * 1600
@@ -75,17 +75,6 @@ def left_in(root):
 
 def sha256(content):
     return hashlib.sha256(content).hexdigest()
-
-
-def test_file_is_fetched_recorded_and_not_requested_again(server, tmp_path):
-    item = picture(server)
-    assert fetched(item, tmp_path) == []
-    assert (tmp_path / "set/a.png").read_bytes() == PNG
-    entries = json.loads((tmp_path / "checksums.json").read_text())
-    assert entries == {"set/a.png": {"sha256": sha256(PNG), "size": len(PNG)}}
-    assert left_in(tmp_path) == ["set/a.png"]
-    assert fetched([item, item], tmp_path) == []
-    assert len(server.log) == 1
 
 
 def test_broken_connection_resumes_where_it_stopped(server, tmp_path):
@@ -318,14 +307,6 @@ def collection(*items, **fields):
 def verified(of, root):
     watcher = Watcher()
     return verify(of, root, watcher), watcher.lines
-
-
-def test_kinds_of_checksums_are_counted(server, tmp_path):
-    both = collection(picture(server), replace(picture(server, name="b.png"), sha256=sha256(PNG)))
-    assert checksums_of(both, tmp_path) == "1 unknown, 1 pinned"
-    fetched(picture(server), tmp_path)
-    assert checksums_of(both, tmp_path) == "1 noted, 1 pinned"
-    assert checksums_of(collection(manual="put it there"), tmp_path) == "noted"
 
 
 def test_damaged_file_is_named_with_both_checksums_and_fetched_again(server, tmp_path):

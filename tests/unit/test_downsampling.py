@@ -104,31 +104,6 @@ def test_holes_are_left_out_of_the_average(kernel, fraction):
     np.testing.assert_allclose(coarse, _slow(values[0].numpy(), kernel, 4), rtol=1e-12)
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_batch_is_downsampled_map_by_map(kernel):
-    values = torch.stack((_values(8, 12, 0), _values(8, 12, 1)))
-    values[1, 0, 2, 3] = torch.nan
-    together = Downsampling(kernel)(values, 2)
-    for i in range(2):
-        torch.testing.assert_close(together[i], Downsampling(kernel)(values[i], 2), rtol=1e-14, atol=0, equal_nan=True)
-
-
-@pytest.mark.parametrize("kernel", KERNELS)
-@pytest.mark.parametrize("holes", [False, True])
-def test_gradient_of_downsampling_is_that_of_its_value(kernel, holes):
-    values = _values(4, 6)
-    mask = torch.ones_like(values, dtype=torch.bool)
-    if holes:
-        mask[0, :2, :2] = False
-        mask[0, 3, 4] = False
-
-    def known_part(values):
-        coarse = Downsampling(kernel)(torch.where(mask, values, torch.nan), 2)
-        return coarse[coarse.isfinite()]
-
-    assert torch.autograd.gradcheck(known_part, values.requires_grad_())
-
-
 def test_size_that_the_scale_does_not_divide_is_refused():
     with pytest.raises(ValueError, match="downsampling: expected"):
         BOX(_values(8, 10), 4)

@@ -2,14 +2,12 @@
 
 import re
 import sys
-from pathlib import Path
 
 import pytest
 
 from dsr.app.entry import run_command
 from dsr.app.schema import plain_config
-from dsr.utils import configuration
-from dsr.utils.configuration import ConfigError, config_directories
+from dsr.utils.configuration import ConfigError
 
 
 @pytest.fixture
@@ -146,18 +144,3 @@ def test_config_dir_adds_choices(command, tmp_path):
     code, error, _ = command("--config-dir", "own", "method=mine")
     assert (code, error.count("\n")) == (2, 1)
     assert "mine.yaml" in error
-
-
-CHECKOUT = Path(__file__).resolve().parents[2] / "conf"
-
-
-def test_configuration_of_an_installed_package_goes_before_that_of_a_checkout(tmp_path, monkeypatch):
-    assert config_directories() == (CHECKOUT,)
-    monkeypatch.setattr(configuration, "_PLACES", (tmp_path / "conf", CHECKOUT))
-    assert config_directories() == (CHECKOUT,)
-    (tmp_path / "conf").mkdir()
-    (tmp_path / "conf" / "eval.yaml").touch()
-    assert config_directories() == (tmp_path / "conf",)
-    monkeypatch.setattr(configuration, "_PLACES", (tmp_path,))
-    with pytest.raises(ValueError, match="the installation is incomplete"):
-        config_directories()

@@ -131,17 +131,6 @@ def test_strongest_window_equals_an_exhaustive_search(seed):
     assert strongest_window(values, 3, 4, [first])[:2] == max(clear, key=clear.get)
 
 
-def test_scores_are_in_thousandths_and_the_best_is_bold(results, drawn, tmp_path):
-    save_grids(tmp_path, results, "renderings")
-    [figure] = drawn.values()
-    captions = [text for text in figure.texts if re.fullmatch(r"\d+ / \d+", text.get_text())]
-    assert len(captions) == 5
-    table = results.scores.query("scene == 'one' and metric == 'DSSIM_v' and variant == 'max'")
-    shown = [int(text.get_text().split(" / ")[0]) for text in captions[:3]]
-    assert shown == [round(1000 * value) for value in table["value"]]
-    assert [text.get_weight() == "bold" for text in captions[:3]] == [value == min(shown) for value in shown]
-
-
 def test_figure_of_lights_shows_their_closed_form(drawn, tmp_path):
     lights_figure.save_lights_figure(tmp_path)
     [figure] = drawn.values()

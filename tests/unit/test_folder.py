@@ -270,17 +270,3 @@ def test_disparity_offset_of_named_scenes_is_left_out(scene):
     describe(scene, baseline=0.5)
     with pytest.raises(ValueError, match=r"without_offset: expected a doffs"):
         without.load("scene")
-
-
-def test_released_scenes_load_with_their_holes(shared):
-    source = Folder(str(shared / "scenes"))
-    assert source.scenes() == ["books", "lucy", "plant"]
-    disparity = np.load(shared / "scenes" / "lucy" / "disparity.npy").astype(np.float64)
-    np.testing.assert_allclose(
-        source.load("lucy").depth[0].double().numpy(), 0.2 * 618.0386007680322 / disparity, rtol=1e-6
-    )
-    books = source.load("books")
-    holes = np.isnan(np.load(shared / "scenes" / "books" / "disparity.npy"))
-    assert holes.any()
-    np.testing.assert_array_equal(books.depth[0].isnan().numpy(), holes)
-    assert books.measured[4].shape == (1, 80, 120)

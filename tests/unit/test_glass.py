@@ -175,19 +175,6 @@ def test_what_is_cut_away_is_no_glass():
     assert float(probability_of_glass(rgb, narrow).max()) > 0
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
-def test_probabilities_have_single_precision_and_no_gradient(dtype):
-    rgb, inverse = _contradiction(textured=True, holes=True)
-    with torch.inference_mode():
-        probability_of_glass(rgb, inverse)
-    found = probability_of_glass(rgb.to(dtype).requires_grad_(), inverse)
-    assert found.dtype == torch.float32
-    assert not found.requires_grad
-    assert float(found.max()) > 0.1
-    assert float(probability_of_glass(rgb.to(dtype), torch.full_like(inverse, torch.nan)).max()) == 0
-    assert probability_of_glass(rgb[:, :3, :4], inverse[:, :1, :2]).shape == (1, 3, 4)
-
-
 @pytest.mark.slow
 def test_wrong_depth_of_simulated_vessels_is_ranked_first_and_expected_to_be_wrong():
     source, aucs = Procedural(4, size=192, seed=5), []

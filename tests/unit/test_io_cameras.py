@@ -105,12 +105,6 @@ def test_command_line_numbers_are_photo_pixels(tmp_path):
     assert found(tmp_path, intrinsics=(60.0, 61.0, 31.0, 24.0)) == (Camera(**OWN), [])
 
 
-def test_field_of_view_is_the_angle_between_the_outer_edges(tmp_path):
-    camera, assumptions = found(tmp_path, fov=90.0)
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((32, 32, 31.5, 23.5))
-    assert assumptions == []
-
-
 def test_unknown_camera_is_assumed_to_have_60_degrees_with_a_note(tmp_path):
     camera, assumptions = found(tmp_path)
     assert math.degrees(2 * math.atan(32 / camera.fx)) == pytest.approx(60)

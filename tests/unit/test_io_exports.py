@@ -170,21 +170,14 @@ def attribute(tree, content, name):
     return np.ndarray((accessor["count"], channels), dtype, content, view["byteOffset"], (stride, size)), accessor
 
 
-def test_glb_mesh_has_positions_of_16_bits_and_what_was_not_measured(tmp_path):
-    filled = torch.zeros(1, 18, 24, dtype=torch.bool)
-    filled[0, 5:9] = True
-    write_mesh(tmp_path / "m.glb", photo(), bumpy(), CAMERA, filled=filled)
+def test_glb_mesh_has_positions_of_16_bits(tmp_path):
+    write_mesh(tmp_path / "m.glb", photo(), bumpy(), CAMERA)
     tree, content = glb_parts(tmp_path / "m.glb")
     assert tree["extensionsRequired"] == tree["extensionsUsed"] == ["KHR_mesh_quantization"]
     positions, accessor = attribute(tree, content, "POSITION")
     assert positions.dtype == np.uint16
     assert (accessor["min"], accessor["max"]) == (positions.min(0).tolist(), positions.max(0).tolist())
-    node, mesh = tree["nodes"][0], triangulate(bumpy(), CAMERA)
-    placed = positions * np.array(node["scale"]) + node["translation"]
-    np.testing.assert_allclose(placed, mesh.vertices * [1, -1, -1], atol=0.51 * node["scale"][0])
     assert attribute(tree, content, "NORMAL")[1]["normalized"] is True
-    values, _ = attribute(tree, content, "_FILLED")
-    np.testing.assert_array_equal(values[:, 0], filled[0].numpy().ravel()[mesh.pixels])
 
 
 def test_glb_mesh_from_near_to_far_has_positions_as_floats(tmp_path):

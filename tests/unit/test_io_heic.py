@@ -13,7 +13,6 @@ from dsr.io.depth_files import read_depth_file
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.pairs import Pair, find_pairs_of_lists
-from dsr.io.photos import read_heic, read_photo
 from dsr.io.reading import CameraChoice, Reading
 
 pytest.importorskip("pillow_heif")
@@ -122,18 +121,6 @@ def test_photo_of_a_pair_may_be_heic_and_is_turned_as_its_jpeg_would_be(tmp_path
     assert float((heic.rgb - jpeg.rgb).abs().mean()) < 0.02
     assert heic.assumptions == jpeg.assumptions
     np.testing.assert_array_equal(heic.depth_lr[0], depth.astype(np.float32))
-
-
-@pytest.mark.parametrize(("orientation", "reported"), [(each, r) for each in range(1, 9) for r in (1, each, 9 - each)])
-def test_photo_is_turned_back_as_its_decoder_turned_it_whatever_the_exif_data_say(tmp_path, orientation, reported):
-    path = write(tmp_path / "photo.heic", orientation=orientation, reported=reported)
-    stored = captures.large_photo()
-    np.save(tmp_path / "depth.npy", captures.depth())
-    found = read_photo(path, captures.depth().shape)[0].astype(float)
-    if reported == 1:
-        stored = read_heic(path)
-    assert found.shape == stored.shape
-    assert np.abs(found - stored).mean() < 4
 
 
 def test_heic_photos_of_a_folder_belong_to_depth_maps_of_their_names(tmp_path):

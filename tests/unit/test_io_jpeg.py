@@ -9,7 +9,6 @@ import pytest
 import torch
 from captures import encoded_jpeg, imaging_model
 from small_files import encoded_png, written
-from upsampling import upsample
 
 from dsr.io.inputs import read_picture
 from dsr.io.layouts import NoPairError, find_pairs_of_folder
@@ -125,14 +124,6 @@ def test_photos_of_a_folder_are_read_unless_depth_maps_are_beside_them(tmp_path)
     assert (pair.capture, pair.depth.name) == (None, "a_depth.png")
     with pytest.raises(NoPairError, match=r"plain\.jpg: expected a folder or depth in a file as .*\.jpg.*; got none"):
         find_pairs_of_folder(plain)
-
-
-def test_damaged_photo_of_a_folder_leaves_the_others(tmp_path, capsys):
-    captures.gdepth(tmp_path / "in" / "a.jpg", LEVELS)
-    REFUSED["segment lost"][0](tmp_path / "in" / "b.jpg")
-    assert upsample(tmp_path / "in", "-o", tmp_path / "out", "--method", "bicubic", "--only", "depth") == 2
-    assert (tmp_path / "out" / "a" / "depth_metres.tiff").is_file()
-    assert "b.jpg: expected GDepth:Data or DepthMap:DepthURI in the XMP" in capsys.readouterr().err
 
 
 def changed(write, old, new, count=-1, **options):

@@ -3,18 +3,10 @@
 import cv2
 import numpy as np
 import pytest
+from small_files import touch
 
 from dsr.io.layouts import find_pairs_of_folder
 from dsr.io.pairs import find_pairs_of_lists
-
-
-def touch(folder, *names):
-    """Make empty files; only their names are looked at."""
-    for name in names:
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
-    return folder
 
 
 def pairs(found, folder):

@@ -202,17 +202,6 @@ def test_order_of_pairs_is_counted_one_by_one(ties):
     assert found.item() == pytest.approx(wrong.mean(), rel=1e-12)
 
 
-def test_prediction_of_holes_alone_has_the_largest_errors():
-    prediction, truth = steps()
-    found = _evalmde(pair_of(np.full_like(prediction, np.nan), truth))
-    assert found.pop("SAWA_H") == pytest.approx(3.65 + 0.18 + 0.01 + 0.2 + 1.94 * math.pi)
-    assert found == {
-        **dict.fromkeys(("WKDR", "beyond_disparity", "beyond_depth", "boundary"), 1),
-        "RelNormal": pytest.approx(math.pi),
-        "covered": 0,
-    }
-
-
 NARROW = Camera(width=48, height=40, fx=60.0, fy=60.0, cx=23.5, cy=19.5)
 RAYS = NARROW.rays()[None]
 V, U = np.mgrid[:40, :48].astype(float)
@@ -283,12 +272,3 @@ def test_only_points_in_the_void_between_surfaces_fly():
     assert _points(np.where(U == 24, 0.5, STEP), STEP)["Points_flying"] == 0  # before both
     assert _points(np.where(U == 45, 1.5, STEP), STEP)["Points_flying"] == 0  # far from the edge
     assert _points(np.where(U == 24, 1.04, STEP), np.where(U < 24, 1.0, 1.045))["Points_flying"] == 0  # no edge
-
-
-def test_hole_does_not_win():
-    prediction = np.where(U == 24, 1.5, STEP)
-    without = np.where(np.abs(U - 24) < 4, np.nan, STEP)
-    found, holed = _points(prediction, STEP), _points(without, STEP)
-    assert holed["Points_flying"] == 0
-    assert holed["Points_covered"] == pytest.approx(41 / 48)
-    assert holed["Points_F_1cm"] < found["Points_F_1cm"]

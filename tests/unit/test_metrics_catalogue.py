@@ -107,7 +107,8 @@ def test_scores_of_a_batch_are_those_of_its_images(protocol, network, one_thread
         found = pair_of(*given)
         errors = 0.1 * found.given[0], 10 * found.given[0]
         regions = {"planes": torch.ones_like(found.target, dtype=torch.uint8)}
-        return found.replaced(regions=regions, depth_error=errors[0], angle_error=errors[1])
+        stated = {"depth_error": errors[0], "angle_error": errors[1], "measured": 1.01 * found.target}
+        return found.replaced(regions=regions, **stated)
 
     batch, singles = pair(*(np.stack(each) for each in zip(*maps, strict=True))), [pair(*each) for each in maps]
     for metric in catalogue(network, protocols=(protocol,)):

@@ -199,12 +199,6 @@ def test_robust_alignment_has_the_least_relative_deviations():
     assert (aligned.flatten().numpy() - y).__abs__() @ cost[2:] == pytest.approx(solved.fun, rel=1e-4)
 
 
-def test_median_scaling_is_numpys():
-    aligned = align(_batch(STRETCHED + 2), _batch(TRUTH), None, "scale")
-    expected = (STRETCHED + 2) * np.median(TRUTH) / np.median(STRETCHED + 2)
-    np.testing.assert_allclose(aligned[0, 0], expected, rtol=1e-14)
-
-
 @pytest.mark.parametrize(
     ("how", "prediction"),
     [

@@ -10,7 +10,7 @@ from depth_steps import pair_of
 from dsr.geometry.camera import Camera
 from dsr.metrics.alignment import align_pair
 from dsr.metrics.catalogue import catalogue, score_image
-from dsr.metrics.harm import compare_to_measured, draw_pairs, enlarge, pair_errors
+from dsr.metrics.harm import draw_pairs, enlarge, pair_errors
 
 METRICS = catalogue(protocols=("harm",))
 CAMERA = Camera.centred(6, 2, 5.0)
@@ -68,17 +68,6 @@ def test_a_smaller_map_is_enlarged_without_bending_planes():
     assert enlarged[0, 4:8, 8:12].isnan().all()
     assert enlarged.isfinite().sum() == 24 * 40 - 16
     torch.testing.assert_close(enlarged[0, 16:], truth[16:])  # away from the hole
-
-
-def test_images_of_a_batch_have_their_own_thirds():
-    first, second = maps(), maps([("measured", (0, 0)), ("prediction", (1, 5))])
-    both = pair_of(*(np.stack(each) for each in zip(first[:2], second[:2], strict=True)), CAMERA)
-    measured = torch.tensor(np.stack((first[2], second[2])))[:, None]
-    found = compare_to_measured(both.replaced(measured=measured))
-    for number, each in enumerate((first, second)):
-        alone = scores(*each)
-        for name, values in found.items():
-            assert float(values[number]) == pytest.approx(alone[f"Harm_{name}"]), name
 
 
 def test_without_a_measurement_or_after_an_alignment_there_is_no_harm_to_score():

@@ -12,14 +12,12 @@ import torch
 from reference_metrics import Intrinsics, reference_scores
 from scipy import ndimage
 from small_lpips import random_lpips
-from torch import nn
 
 from dsr.geometry.camera import Camera
 from dsr.metrics import functional
 from dsr.metrics.catalogue import catalogue
 from dsr.metrics.classes import DSSIMv, LPIPSv, PerImageMean, RMSEd, compute_means, visual_metrics
 from dsr.metrics.functional import SurfacePair, dssim_v, masked_median, mse_v, rmse_d, rmse_v
-from dsr.metrics.lpips import LPIPS
 from dsr.sample import Unit
 
 
@@ -257,15 +255,6 @@ def test_metrics_that_agree_on_the_first_image_stay_separate():
         assert values[f"BadPix_v_{percent}"].item() == functional.bad_pix_v(pair, percent).max().item() / 2
     for name, function in METRICS.items():
         assert values[name].item() == pytest.approx(function(pair).max().item() / 2, rel=1e-9, abs=1e-9)
-
-
-def test_a_model_with_metrics_has_nothing_of_the_perceptual_network(network):
-    model = nn.Sequential(nn.Linear(2, 1))
-    model.metrics = visual_metrics(network)
-    model.single = model.metrics["LPIPS_v"]
-    model.metrics.update(_ramp(0))
-    assert set(model.state_dict()) == {name for name, _ in model.named_parameters()} == {"0.weight", "0.bias"}
-    assert not any(isinstance(module, LPIPS) for module in model.modules())
 
 
 def test_mean_is_nan_where_a_prediction_leaves_nothing_to_score():

@@ -1,6 +1,5 @@
 """Frames in the order of the numbers in their names, 2 before 10, so that each gets its own pose in every layout."""
 
-import json
 import random
 import re
 from functools import partial
@@ -9,11 +8,9 @@ import captures
 import numpy as np
 import pytest
 
-from dsr.cli import main
 from dsr.data.folder import Folder
 from dsr.io.inputs import Reading, read_picture
 from dsr.io.layouts import find_pairs_of_folder
-from dsr.io.trajectories import read_poses
 from dsr.utils.guards import natural_key
 
 FRAMES = 12
@@ -120,24 +117,11 @@ PAIRS = {
 }
 
 
-def write_poses(path, kind="matrices"):
-    """Write the poses of the frames in order, without times or with times that no frame has in its name."""
-    rows = [" ".join(f"{value:.9f}" for value in captures.pose(number)[:3].ravel()) for number in range(FRAMES)]
-    if kind == "times":
-        rows = [f"{1e9 + number} {0.1 * number} 0 0 0 0 0 1" for number in range(FRAMES)]
-        random.Random(0).shuffle(rows)
-    path.write_text("\n".join(rows) + "\n")
-    return path
-
-
 @pytest.mark.parametrize("style", NAMES)
 @pytest.mark.parametrize("layout", PAIRS)
-def test_pairs_have_the_poses_of_a_file_in_order(folder, tmp_path, layout, style):
+def test_pairs_are_in_the_order_of_their_numbers(folder, layout, style):
     found = find_pairs_of_folder(pairs(folder, style, *PAIRS[layout])).pairs
     assert frame_numbers(found)[0] == list(range(FRAMES))
-    for kind in ("matrices", "times"):
-        given = read_poses(write_poses(tmp_path / "poses.txt", kind)).assign(found)
-        assert pose_numbers([given[pair.name] for pair in found]) == list(range(FRAMES))
 
 
 def test_scenes_of_dsr_and_folders_of_folders_are_in_order(folder):
@@ -157,19 +141,6 @@ def test_times_in_names_decide_rather_than_their_digits(folder):
         captures.save(folder / "rgb" / f"{time}.png", captures.photo(number))
         captures.save(folder / "depth" / f"{time}.png", captures.millimetres(number))
     assert frame_numbers(find_pairs_of_folder(folder).pairs)[0] == list(range(FRAMES))
-
-
-def test_photos_in_an_order_of_the_users_own_keep_it(folder, tmp_path, capsys):
-    pairs(folder, "plain", *PAIRS["two folders"])
-    order = list(reversed(range(FRAMES)))
-    listed = [f"--{kind}" if number is None else folder / kind / f"{number}.png"
-              for kind in ("rgb", "depth") for number in (None, *order)]  # fmt: skip
-    options = ("--method", "nearest", "--only", "depth", "--depth-unit", "mm", "--fov", "60")
-    arguments = (*listed, "--poses", write_poses(tmp_path / "poses.txt"), "-o", tmp_path / "out", *options)
-    assert main(["upsample", *map(str, arguments)]) == 0
-    capsys.readouterr()
-    poses = [json.loads((tmp_path / "out" / f"{number}" / "info.json").read_text())["pose"] for number in order]
-    assert pose_numbers(np.array(poses)) == list(range(FRAMES))
 
 
 def test_key_sorts_numbers_by_value_and_paths_folder_by_folder():

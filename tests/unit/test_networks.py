@@ -16,10 +16,8 @@ from dsr.methods.networks.network import (
     ENSEMBLES,
     DisparityNetwork,
     NetworkUpsampler,
-    apply_dihedral,
     blend_tiles,
     split_axis,
-    undo_dihedral,
 )
 from dsr.methods.networks.pdn import PrimalDualNetwork
 from dsr.methods.networks.sparse_to_dense import SparseToDense
@@ -145,16 +143,6 @@ def _method(name, *, ensemble=1):
     return NetworkUpsampler(net.double(), ensemble=ensemble)
 
 
-@pytest.mark.parametrize(("size", "tile", "overlap"), [(100, 30, 4), (31, 30, 4), (30, 30, 4), (7, 1, 2), (1, 5, 0)])
-def test_tile_weights_add_up_to_one_everywhere(size, tile, overlap):
-    total = torch.zeros(2 * size)
-    for span in split_axis(size, tile, 3, overlap):
-        assert span.read.start <= span.kept.start < span.kept.stop <= span.read.stop
-        assert span.kept.stop - span.kept.start <= max(tile, overlap + 1) + overlap
-        total[2 * span.kept.start : 2 * span.kept.stop] += span.weights(2)
-    torch.testing.assert_close(total, torch.ones(2 * size))
-
-
 def test_results_that_differ_by_a_constant_are_joined_by_a_ramp():
     values = iter((1.0, 2.0))
     rows, columns = split_axis(4, 4, 0, 0), split_axis(20, 10, 0, 4)
@@ -190,14 +178,6 @@ def test_large_photo_is_tiled_automatically(monkeypatch):
     tiled = method(sample, lambda done, total: parts.append(total))
     assert parts == [1, *[4] * 4]
     torch.testing.assert_close(tiled, whole, rtol=1e-5, atol=0)
-
-
-@pytest.mark.parametrize("index", range(8))
-def test_dihedral_transforms_are_distinct_and_invertible(index):
-    x = torch.rand(2, 3, 5, 5)
-    turned = apply_dihedral(x, index)
-    assert torch.equal(undo_dihedral(turned, index), x)
-    assert not any(torch.equal(turned, apply_dihedral(x, other)) for other in range(8) if other != index)
 
 
 def test_augmentation_averages_what_depends_on_the_orientation():

@@ -1,6 +1,5 @@
 """Trainings without Hydra: the lines of docs/python.md, stock loggers, and checkpoints that say what they are of."""
 
-import csv
 import functools
 import re
 from pathlib import Path
@@ -9,10 +8,7 @@ from typing import Any
 import lightning
 import pytest
 import torch
-from lightning.pytorch.callbacks import Callback
-from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from small_scenes import sample_of, step
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor
 
 from dsr.data.rendered import Procedural
@@ -69,53 +65,6 @@ def test_lines_of_the_documentation_compute_metrics() -> None:
     exec(compile(lines, PAGE, "exec"), names)
     means = names["metrics"].compute()
     assert (float(means["BadPix_d_1pct"]), float(means["BadPix_d_5pct"])) == (1, 0)
-
-
-class _Batches(Callback):
-    """The batches of a training."""
-
-    def __init__(self) -> None:
-        self.seen: list[Any] = []
-
-    def on_train_batch_start(self, trainer: Any, pl_module: Any, batch: Any, batch_idx: int) -> None:
-        self.seen.append(batch)
-
-
-def test_loader_prepares_patches_for_the_network_of_the_module(tmp_path: Path) -> None:
-    batches, net = _Batches(), FacetsUNet(4, 8, 8, 4)
-    trainer = _trainer(tmp_path, max_steps=2, callbacks=[batches], limit_val_batches=0)
-    trainer.fit(SuperResolution(net, SurfaceObjective()), _data(everything=Everything()))
-    assert all(bool(batch["filled"].isfinite().all()) and len(batch["kernels"]) == 2 for batch in batches.seen)
-    assert len(batches.seen) == 2
-
-
-def test_stock_loggers_get_losses_scores_and_pictures(tmp_path: Path) -> None:
-    loggers = [TensorBoardLogger(tmp_path, "board"), CSVLogger(tmp_path, "table")]
-    torch.manual_seed(0)
-    trainer = _trainer(tmp_path, max_steps=2, logger=loggers, val_check_interval=1)
-    trainer.fit(SuperResolution(MSGNet(4), DepthObjective(w=0.7)), _data())
-    board = EventAccumulator(str(loggers[0].log_dir), size_guidance={"images": 0}).Reload()
-    tags = board.Tags()
-    assert {"train/loss", "train/gradient_norm", "train/learning_rate", "val/RMSE_v"} <= set(tags["scalars"])
-    assert tags["images"] == ["renderings/val_0"]
-    with Path(str(loggers[1].log_dir), "metrics.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["step"] for row in rows if row["train/loss"]] == ["2"]  # the mean of both
-    assert [row["step"] for row in rows if row["val/RMSE_v"]] == ["1", "2"]
-
-
-def test_epochs_and_their_validations_are_the_trainers(tmp_path: Path) -> None:
-    validated: list[int] = []
-
-    class Watch(lightning.Callback):
-        def on_validation_end(self, trainer: Any, pl_module: Any) -> None:
-            validated.append(trainer.global_step)
-
-    trainer = _trainer(
-        tmp_path, max_epochs=2, limit_train_batches=3, num_sanity_val_steps=0, callbacks=[Watch()], logger=False
-    )
-    trainer.fit(SuperResolution(MSGNet(4), DepthObjective()), _data())
-    assert (trainer.global_step, validated) == (6, [3, 6])
 
 
 def _same(first: SuperResolution, second: SuperResolution) -> bool:

@@ -97,12 +97,6 @@ def test_many_scenes_make_numbered_pages_and_are_loaded_one_at_a_time(tmp_path, 
     assert [text for text in written if text.startswith("scene ")] == [f"scene {n}" for n in range(PAGE + 2)]
 
 
-def test_empty_sheet_is_refused_and_writes_nothing(tmp_path):
-    with pytest.raises(ValueError, match=r"toys.png: expected a scene or more for a contact sheet, got none"):
-        save_contact_sheet(tmp_path / "toys.png", [], "Toys")
-    assert list(tmp_path.iterdir()) == []
-
-
 # The picture of a result
 
 

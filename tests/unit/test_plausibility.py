@@ -6,15 +6,9 @@ import pytest
 import torch
 
 from dsr.geometry.camera import Camera
-from dsr.inference import upsample_surface
 from dsr.inference.plausibility import count_patches, expect_errors, find_outliers, within_measured
 
 HEIGHT, WIDTH = 96, 640
-FRAMES = {
-    "ddrnet": ("ddrnet/color_map/frame_000001.png", "ddrnet/depth_map/frame_000001.png", 90, 200),
-    "camera": ("depth_camera/0/rgb.png", "depth_camera/0/raw_depth.png", 230, 300),
-}  # Photo, depth in mm, and the upper left corner of a window
-WINDOW = 208
 
 
 def wall(depth=4.0):
@@ -129,45 +123,6 @@ def test_result_is_at_most_twice_as_far_as_what_is_measured():
     given[:, :, 30:] = 2.0
     kept = within_measured(torch.full_like(given, 1e-6), given)
     torch.testing.assert_close(kept[0, 0, [10, 59]], torch.tensor([0.05, 2.0]), rtol=2e-3, atol=0)
-
-
-@pytest.fixture(scope="module", params=FRAMES)
-def frame(shared, request):
-    """A window of a real frame: photo, depth in metres, camera, and its result."""
-    *files, top, left = FRAMES[request.param]
-    photo, depth = (cv2.imread(str(shared / "real" / file), cv2.IMREAD_UNCHANGED) for file in files)
-    window = (slice(top, top + WINDOW), slice(left, left + WINDOW))
-    photo = torch.from_numpy(photo[window][..., ::-1].copy()).permute(2, 0, 1) / 255
-    depth = torch.from_numpy(depth[window].astype(np.float32))[None] / 1000
-    depth = depth.masked_fill(depth == 0, torch.nan)
-    camera = Camera(WINDOW, WINDOW, 536.6, 536.6, 310.6 - left, 234.8 - top)
-    return photo, depth, camera, upsample_surface(photo, depth, camera)
-
-
-def test_bad_patches_in_a_real_map_change_nothing_around_them(frame):
-    photo, depth, camera, clean = frame
-    assert clean.outliers == (0, 0)
-    places = np.argwhere(depth[0, 8:-14, 8:-14].isfinite().numpy()) + 8
-    bad, touched = depth.clone(), np.ones((WINDOW, WINDOW), np.uint8)
-    chosen = []
-    for row, column in np.random.default_rng(0).permutation(places).tolist():
-        if len(chosen) < 15 and all(max(abs(row - r), abs(column - c)) > 7 for r, c in chosen):
-            chosen.append((row, column))
-            bad[:, row : row + 6, column : column + 6] = (0.025, 65.5)[len(chosen) % 2]
-            touched[row : row + 6, column : column + 6] = 0
-    found = upsample_surface(photo, bad, camera)
-    assert found.outliers == (15 * 36, 15)
-    away = torch.from_numpy(cv2.distanceTransform(touched, cv2.DIST_L2, cv2.DIST_MASK_PRECISE))[None] > 12
-    both = away & clean.depth.isfinite() & found.depth.isfinite()
-    assert torch.equal(clean.depth.isfinite()[away], found.depth.isfinite()[away])
-    assert ((found.depth / clean.depth - 1).abs() > 0.01)[both].double().mean() < 1e-3
-    given = bad.masked_fill(torch.from_numpy(touched == 0)[None], torch.nan).reciprocal()
-    windows = torch.nn.functional.pad(given, (24,) * 4, value=torch.nan)[0].unfold(0, 49, 1).unfold(1, 49, 1)
-    low = windows.nan_to_num(torch.inf).amin((2, 3))[None]
-    high = windows.nan_to_num(-torch.inf).amax((2, 3))[None]
-    inverse, margin = found.depth.reciprocal(), (high - low) / 2 + 1e-5
-    outside = (inverse < low - margin) | (inverse > high + margin)
-    assert not (outside & high.isfinite())[inverse.isfinite()].any()
 
 
 CAMERA = Camera.from_fov(60, 96, 64)

@@ -2,7 +2,6 @@
 
 import io
 
-import pytest
 from rich.console import Console
 
 from dsr.utils.console import ConsoleProgress
@@ -63,32 +62,6 @@ def test_running_work_gets_a_line_after_three_seconds_and_then_every_ten_with_th
         "predict statue: 1 of 1, 11.0 s, elapsed 0:00:11, remaining 0:00:00",
         "set/a.zip: 600 MB of 800 MB, 1.0 MB/s, elapsed 0:01:40, remaining 0:03:20",
     ]
-
-
-def test_terminal_shows_a_bar_for_each_task_and_keeps_one_line_of_a_pass_that_took_long():
-    now, progress, text = shown(terminal=True)
-    for _ in progress.track(["statue"], "predict"):
-        with progress.task("steps", 100) as step:
-            now.seconds += 65
-            step(65, remark="loss 0.25")
-            progress._bars.refresh()
-            progress.say("statue: [about] 3 min")
-    for line in (
-        "0 of 1, elapsed 0:01:05, statue",
-        "65 of 100, elapsed 0:01:05, remaining 0:00:35, loss 0.25",
-        "statue: [about] 3 min\n",
-    ):
-        assert line in text.getvalue()
-    assert text.getvalue().endswith("predict: 1 of 1, elapsed 0:01:05\n")
-
-
-@pytest.mark.parametrize("terminal", [True, False])
-def test_next_pass_is_shown_after_an_error(terminal):
-    _, progress, _ = shown(terminal)
-    for _ in range(2):
-        with pytest.raises(ValueError, match="broken"), progress.task("predict", 2), progress.task("steps", 10):
-            raise ValueError("broken")
-    assert list(progress.track(["c"], "score")) == ["c"]
 
 
 def test_stages_times_sizes_and_lengths_are_written_for_readers():

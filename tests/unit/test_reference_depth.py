@@ -41,12 +41,6 @@ def test_edges_and_holes_are_borders_of_the_smoothing():
     np.testing.assert_allclose(smooth[~np.isnan(levels)], levels[~np.isnan(levels)], atol=1e-6)
 
 
-def test_isolated_plateau_is_unchanged():
-    levels = np.full((9, 9), np.nan)
-    levels[3:6, 3:6] = 7.0
-    np.testing.assert_allclose(smooth_levels(levels)[3:6, 3:6], 7.0, atol=1e-9)
-
-
 CAMERA = Camera(90, 60, 80.0, 82.0, 44.0, 30.5, baseline=0.1, doffs=3.0)
 
 

@@ -173,16 +173,6 @@ def test_predictions_that_are_damaged_or_of_another_size_are_left_out_and_named(
         assert any(text in note for note in data["notes"]), data["notes"]
 
 
-def test_result_whose_expected_errors_do_not_fit_is_shown_without_them(make_run, tmp_path):
-    results = load_results([make_run(tmp_path / "run", confident=True)])
-    path = tmp_path / "run" / "predictions" / "cube_no_texture.npz"
-    with np.load(path) as stored:
-        np.savez(path, **{**stored, "depth_error": stored["depth_error"][1:]})
-    _, data, scene = saved(tmp_path, results)
-    assert "expected" not in scene["surfaces"][1]
-    assert any("cube_no_texture" in note for note in data["notes"])
-
-
 # The standings
 
 

@@ -1,10 +1,8 @@
 """Scores in the units of the paper's tables, beside what the paper says."""
 
 import io
-import math
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
@@ -77,32 +75,3 @@ def test_published_values_stand_below_ours_in_the_same_units():
     assert row(printed, ["lucy"], "dsr") == ["70.4", "6.70", "49.5", "354", "424", "1.39", "274"]
     assert row(printed, [], "paper") == ["72.0", "6.80", "48.8", "355", "398", "1.37", "267"]
     assert "*" not in printed
-
-
-@pytest.mark.parametrize("size", [512, 64])
-def test_published_values_stand_beside_the_papers_files_in_a_folder_at_their_own_size(tmp_path, size):
-    (tmp_path / "predictions").mkdir()
-    np.savez_compressed(tmp_path / "predictions" / "plant.npz", depth=np.ones((size, size), np.float32))
-    printed = text(bicubic("plant", "sofa", name="mine", folder=tmp_path, _target_="dsr.data.folder.Folder"))
-    assert printed.count("paper") == (size == 512)
-
-
-def test_published_average_stands_below_the_mean_of_all_scenes():
-    seven = ("vintage", "recycle", "umbrella", "classroom1", "playroom", "backpack", "jadeplant")
-    average = published()[
-        (published()["scene"] == "Average performance on Middlebury dataset")
-        & (published()["method"] == "Bicubic") & (published()["scale"] == 4)
-    ]  # fmt: skip
-    lines = text(bicubic(*seven, name="middlebury")).splitlines()
-    place = next(number for number, line in enumerate(lines) if line.split()[:1] == ["mean"])
-    assert lines[place + 1].split()[:2] == ["paper", f"{average['RMSE_d'].item():.1f}"]
-    assert text(bicubic(*seven[1:], name="middlebury")).split("mean")[1].count("paper") == 0
-
-
-def test_unknown_value_is_a_dash_and_left_out_of_the_mean():
-    run = bicubic("lucy", "other")
-    table = run.scores
-    table.loc[(table["scene"] == "other") & (table["metric"] == "RMSE_d"), "value"] = math.nan
-    printed = text(run)
-    assert row(printed, ["other"], "dsr")[0] == "-"
-    assert row(printed, ["mean"], "dsr")[0] == "70.4"

@@ -95,20 +95,3 @@ def test_runs_can_be_chosen_and_unknown_ones_are_refused(make_run, tmp_path):
         results.only(["DIP"])
     with pytest.raises(ValueError, match="there is none"):
         results.only(["Bicubic"], scales=[2])
-
-
-@pytest.mark.parametrize(
-    ("name", "entries", "message"),
-    [
-        ("summary.json", {"scale": "four"}, "scale: expected a valid number"),
-        ("summary.json", {"seconds": [1]}, "seconds: expected an object, got [1]"),
-        ("summary.json", {"metrics": {"PSNR": {"unit": "dB"}}}, "metrics.PSNR.heading: it is missing"),
-        ("versions.json", {"identity": "x"}, "identity: expected an object, got 'x'"),
-    ],
-)
-def test_wrong_key_of_a_runs_file_is_named_with_what_was_expected(make_run, tmp_path, name, entries, message):
-    make_run(tmp_path / "fine", scenes=("s",))
-    make_run(tmp_path / "wrong", scenes=("s",), label="MSG")
-    change(tmp_path / "wrong", name, **entries)
-    [note] = load_results([tmp_path]).notes
-    assert note.startswith(f"left out: {tmp_path / 'wrong' / name}: {message}")

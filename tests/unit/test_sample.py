@@ -183,16 +183,6 @@ def test_regions_are_cropped_handed_on_and_read(tmp_path):
             _scene(regions={"planes": region})
 
 
-@pytest.mark.parametrize("content", [b"", b"text", None])
-def test_file_that_is_no_sample_is_refused_by_its_name(tmp_path, content):
-    path = tmp_path / "hall.npz"
-    if content is not None:
-        path.write_bytes(content)
-    came = "there is none" if content is None else "got a damaged or foreign file"
-    with pytest.raises(ValueError, match=f"hall.npz: expected the sample of a scene, {came}"):
-        DepthSample.load(path)
-
-
 def test_disparity_lr_is_in_pixels_of_the_high_resolution_camera():
     camera = replace(CAMERA, doffs=1.5)
     sample = _sample(camera=camera, camera_lr=camera.rescale(4, 2), depth_lr=_with((1, 2, 4), math.nan))

@@ -264,17 +264,6 @@ def test_points_are_those_that_frames_agree_on_and_are_certain_of(walls, tmp_pat
     assert len(read_colmap(tmp_path / "two/sparse/0")[2]) == 2 * 8 * 12
 
 
-def test_colmap_model_is_read_by_colmap(walls, tmp_path):
-    pycolmap = pytest.importorskip("pycolmap", reason="pip install pycolmap")
-    write_splatting(tmp_path, walls)
-    model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
-    assert sorted(image.name for image in model.images.values()) == [f"room_00{number}.png" for number in range(3)]
-    for point in model.points3D.values():
-        for element in point.track.elements:
-            image = model.images[element.image_id]
-            np.testing.assert_allclose(image.project_point(point.xyz), image.points2D[element.point2D_idx].xy)
-
-
 def test_initial_gaussians_are_discs_on_the_surface(make, tmp_path):
     frame, depth = make(0), (2 / (1 + CAMERA.rays()[0].numpy())).astype(np.float32)  # the plane x + z = 2
     write_depth_file(frame.depth, depth)
@@ -302,25 +291,15 @@ def test_initial_gaussians_are_discs_on_the_surface(make, tmp_path):
     assert opacity[3, 2] == pytest.approx(math.erf(width / 0.25 / math.sqrt(math.pi)), rel=1e-4)
 
 
-def read_recording(path):
-    """Return the columns of a recording by entity and name, as rerun reads them."""
+def test_rerun_recording_is_read_back(make, tmp_path):
+    """As rerun reads it: columns by entity and name."""
     chunk = pytest.importorskip("rerun.chunk", reason="pip install -e '.[rerun]'")
-    columns = {}
+    path, columns = tmp_path / "scene.rrd", {}
+    assert write_rerun(path, [make(0), make(1, pose=None)]) == [path]
     for part in chunk.RrdReader(str(path)).stream():
         batch = part.to_record_batch()
         for name in batch.schema.names:
             columns.setdefault((part.entity_path, name), []).extend(batch.column(name).to_pylist())
-    return columns
-
-
-def test_rerun_recording_is_read_back(make, tmp_path):
-    frames = [make(0), make(1, pose=None)]
-    path = tmp_path / "scene.rrd"
-    pytest.importorskip("rerun", reason="pip install -e '.[rerun]'")
-    assert write_rerun(path, frames) == [path]
-    assert [each.name for each in tmp_path.iterdir() if each.is_file()] == ["scene.rrd"]
-    columns = read_recording(path)
-    assert {"/", "/camera", "/camera/rgb", "/camera/depth"} <= {entity for entity, _ in columns}
     matrices = np.array(columns["/camera", "Pinhole:image_from_camera"]).reshape(2, 3, 3)
     np.testing.assert_allclose(matrices[0].T, [[10, 0, 5.75], [0, 11, 4], [0, 0, 1]])
     shifts = np.array(columns["/camera", "Transform3D:translation"]).reshape(2, 3)
@@ -330,14 +309,11 @@ def test_rerun_recording_is_read_back(make, tmp_path):
     meters = np.array(columns["/camera/depth", "EncodedDepthImage:meter"]).ravel()
     for number, [blob] in enumerate(columns["/camera/depth", "EncodedDepthImage:blob"]):
         values = cv2.imdecode(np.frombuffer(bytes(blob), np.uint8), cv2.IMREAD_UNCHANGED)
-        assert values.dtype == np.uint16
         np.testing.assert_allclose(values / meters[number], np.nan_to_num(depth_map(number)), atol=5.1e-4)
     for number, [blob] in enumerate(columns["/camera/rgb", "EncodedImage:blob"]):
-        assert bytes(blob[:3]) == b"\xff\xd8\xff"
         photo = cv2.imdecode(np.frombuffer(bytes(blob), np.uint8), cv2.IMREAD_COLOR)
         np.testing.assert_allclose(photo[4:, :, 2], 255 * number / 10, atol=4)
     assert columns["/camera/depth", "frame"] == [0, 1]
-    assert ("/camera/depth", "time") not in columns
 
 
 @pytest.mark.parametrize("value", ["no list", np.eye(4)[:3].tolist(), (2 * np.eye(4)).tolist()])

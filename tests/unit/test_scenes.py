@@ -7,7 +7,7 @@ import functools
 import json
 import math
 import time
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pandas as pd
@@ -21,7 +21,7 @@ from dsr.evaluation.scenes import Evaluation, StalePredictionError, evaluate_sce
 from dsr.geometry.camera import Camera
 from dsr.methods.base import Method, NoSolutionError
 from dsr.metrics.catalogue import catalogue, score_image
-from dsr.sample import DepthSample, Scene
+from dsr.sample import Scene
 from dsr.utils.files import FullDiskError
 from dsr.utils.progress import SILENT, Progress
 
@@ -164,21 +164,6 @@ def test_summary_and_pictures_have_the_worst_of_four_lights(tmp_path):
     assert torch.equal(depth, load_prediction(tmp_path / "predictions" / "a.npz"))
 
 
-def test_second_run_reuses_predictions_without_calling_the_method_and_stores_a_missing_sample_again(tmp_path):
-    _, first = run(toy_study(tmp_path))
-    before = {name: (tmp_path / name).stat().st_mtime_ns for name in files(tmp_path) if name.startswith("pred")}
-    sample = DepthSample.load(tmp_path / "scenes" / "a.npz")
-    (tmp_path / "scenes" / "a.npz").unlink()
-    method = ToyMethod()
-    results, second = run(toy_study(tmp_path, method=method))
-    assert method.calls == []
-    assert all(each.reused for each in results.values())
-    assert summary(tmp_path)["reused"] == ["a", "b"]
-    assert before == {name: (tmp_path / name).stat().st_mtime_ns for name in before}
-    assert first.equals(second)
-    assert torch.equal(DepthSample.load(tmp_path / "scenes" / "a.npz").depth_lr, sample.depth_lr)
-
-
 def test_overwrite_makes_every_prediction_anew_and_replaces_it_atomically(tmp_path):
     run(toy_study(tmp_path))
     path = tmp_path / "predictions" / "a.npz"
@@ -295,13 +280,6 @@ def test_scene_without_truth_is_predicted_and_drawn_but_not_scored(tmp_path):
     assert (content["without_truth"], list(content["truths"])) == (["blind"], ["seen"])
 
 
-def test_cropped_scene_is_noted(tmp_path):
-    camera = Camera(SIZE + 1, SIZE, 20.0, 20.0, 7.5, 7.5)
-    rgb, depth = torch.full((3, SIZE, SIZE + 1), 0.5), torch.full((1, SIZE, SIZE + 1), 2.0).double()
-    run(toy_study(tmp_path, ToySource(odd=Scene("toy", "odd", rgb, camera, depth))))
-    assert summary(tmp_path)["notes"] == {"odd": ["cropped from 16 x 17 to 16 x 16, which 2 divides"]}
-
-
 def half_written(error):
     """Return a writer of arrays that fails after half a file."""
 
@@ -394,14 +372,6 @@ def test_scenes_of_several_threads_are_predicted_one_at_a_time_and_written_as_on
         results = dict(zip(content, pool.map(functools.partial(evaluate_scene, studies[1]), content), strict=True))
     write_tables(studies[1], results)
     assert rows(tmp_path / "together") == rows(tmp_path / "apart")
-
-
-def test_no_prediction_begins_after_an_interruption(tmp_path):
-    study = toy_study(tmp_path)
-    study.ended.set()
-    with pytest.raises(CancelledError):
-        evaluate_scene(study, "a")
-    assert not (tmp_path / "predictions").exists()
 
 
 def test_scene_without_a_solution_is_a_result_and_no_failure_and_its_earlier_prediction_goes(tmp_path):

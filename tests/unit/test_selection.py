@@ -81,14 +81,6 @@ def test_method_at_another_scale_gives_what_upsample_gives(name: str, size: tupl
     assert bool(depth.isnan().any()) == (name == "eg")
 
 
-def test_method_at_another_scale_describes_how_the_map_is_resized() -> None:
-    selected = _resized("facets_box", 1)
-    method = selected.build(Run())
-    assert method.describe(_sample(48, 36)) == "36 x 48 depth averaged over 4 x 4 pixels, to 36 x 48 by facets_box x4"
-    assert method.describe(_sample(7, 5)) == "5 x 7 depth to 36 x 48 by facets_box x8"
-    assert [path.stem for path in selected.files()] == ["facets_box_x4", "facets_box_x8"]
-
-
 class Sure(Method):
     """Repeats pixels, and says that it is off by a tenth of the depth."""
 

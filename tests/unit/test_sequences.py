@@ -11,7 +11,6 @@ from small_scenes import sphere_depth
 
 from dsr.geometry.camera import Camera
 from dsr.geometry.poses import PosedMap, as_rigid, check_poses, invert
-from dsr.geometry.poses import sample as sampled
 from dsr.inference.sequences import View, fuse_views
 from dsr.synthetic.raycast import rotation
 
@@ -215,18 +214,3 @@ def test_frames_that_cannot_be_read_are_left_out():
     assert check_poses(8, lambda number: None) is None
     some = check_poses(8, lambda n: None if n == 1 else PosedMap(small_room(SMALL, poses[n]), SMALL, invert(poses[n])))
     assert some is not None
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("factor", [1e-300, 1e30, 1e307])
-def test_poses_of_any_magnitude_are_compared(factor):
-    found = checked(walk(4), lambda pose: scaled(pose, factor))
-    assert found is None or found.code.startswith("poses")
-
-
-def test_frames_are_sampled_within_the_sequence_and_few_of_a_long_one():
-    for count in (0, 1, 2, 5, 31, 100_000):
-        groups = sampled(count)
-        assert all(0 <= number < count for group in groups for number in group)
-        assert sum(map(len, groups)) <= 20
-        assert (len(groups) > 0) == (count > 1)

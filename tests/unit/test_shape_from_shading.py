@@ -199,19 +199,6 @@ def test_slanted_plane_of_one_colour_is_reproduced_to_a_hundredth_of_its_depth(s
     assert float((fine / truth - 1).square().mean().sqrt()) < 1e-3
 
 
-def test_batch_equals_its_problems_one_at_a_time():
-    solvers = [ShapeFromShading().prepare(_sample(*_random(16, 16, seed)))[0] for seed in (0, 1)]
-    one, other = (solver.problem for solver in solvers)
-    joined = {name: torch.cat((getattr(one, name), getattr(other, name))) for name in ("rgb", "lr", "inside")}
-    together = ShadingSolver(one._replace(**joined), torch.cat([solver.z for solver in solvers]), 0.02)
-    for solver in (together, *solvers):
-        for _ in range(2):
-            solver.update_lighting()
-            solver.update_theta()
-            solver.update_depth(1.3)
-    torch.testing.assert_close(together.z, torch.cat([solver.z for solver in solvers]), rtol=1e-5, atol=0)
-
-
 def test_iteration_stops_at_convergence_and_reports_progress():
     reported, truth = [], _sphere(32)
     method = ShapeFromShading(iterations=60, tolerance=3e-3)

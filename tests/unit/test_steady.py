@@ -89,18 +89,6 @@ def test_mean_outlasts_some_frames_of_holes(holes):
     torch.testing.assert_close(steady(flat(2.1, 0.1), PHOTO).depth, flat(expected).depth)
 
 
-def test_last_results_are_all_that_the_next_one_depends_on():
-    frames = surfaces(30, factor=3.0)
-    for number, each in enumerate(frames):
-        each.depth[:, number % 7 :: 7, : 3 * number] = torch.nan
-    steady, again = Steady(), Steady()
-    results = [steady(each, PHOTO) for each in frames[:-1]]
-    for each in results[-KEPT:]:
-        again.remember(each, PHOTO)
-    for one, other in zip(steady(frames[-1], PHOTO)[:2], again(frames[-1], PHOTO)[:2], strict=True):
-        assert torch.equal(one.nan_to_num(0), other.nan_to_num(0))
-
-
 def test_other_sizes_begin_anew_and_bad_values_are_refused():
     small = Surface(torch.full((1, 4, 5), 3.0), torch.full((1, 4, 5), 9.0))
     assert (begun()(small, torch.zeros(3, 4, 5)).depth == 3).all()

@@ -143,15 +143,6 @@ def _upsampled(tgv, lr):
     return tgv.minimise(rgb, ((lr - low) / size)[None, None], 4).values[0, 0] * size + low
 
 
-def test_batch_equals_its_samples_one_at_a_time():
-    coarse, photos = normal(2, 1, 4, 6).sigmoid(), normal(2, 3, 16, 24, seed=1).sigmoid()
-    method = TotalGeneralisedVariation(iterations=100, tolerance=0.0)
-    together = method.minimise(photos, coarse, 4).values
-    for number in range(2):
-        alone = method.minimise(photos[number : number + 1], coarse[number : number + 1], 4).values[0]
-        torch.testing.assert_close(together[number], alone)
-
-
 def test_iteration_stops_at_convergence_and_reports_progress():
     reported = []
     sample = sample_of(plane())

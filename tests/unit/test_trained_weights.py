@@ -155,15 +155,6 @@ def test_missing_files_other_scales_and_other_tensors_are_refused_by_name(tmp_pa
         assert message in _refusal(write(path, {**state, **change}), load, 4)
 
 
-def test_file_truncated_or_changed_anywhere_is_refused(tmp_path):
-    whole = _file(tmp_path / "w").read_bytes()
-    header = 8 + int.from_bytes(whole[:8], "little")
-    damaged = [whole[:length] for length in (9, 100, header - 1, header, header + 1000, len(whole) - 1)]
-    damaged += [size.to_bytes(8, "little") + whole[8:] for size in (2**64 - 1, 2**40, header - 20)]
-    for content in damaged:
-        assert "expected a safetensors file, got a damaged one" in _refusal(_write(tmp_path / "w", content))
-
-
 @pytest.mark.parametrize(
     "changes",
     [{"network": "UNet"}, {"arguments": {"scale": 3}}, {"arguments": {"scale": 4, "depth": 9}}, {"arguments": [4]}],
@@ -265,11 +256,7 @@ def test_code_in_a_file_is_not_run(tmp_path):
 
 
 def test_damaged_and_foreign_files_are_refused(tmp_path):
-    whole, path = published(tmp_path / "whole.pth").read_bytes(), tmp_path / "net.caffemodel"
-    noise = np.random.default_rng(0).bytes(10_000)
-    foreign = (b"", noise, b"\x80" + noise, b"PK\x03\x04" + noise, b"\x89PNG\r\n\x1a\n")
-    for content in (whole[:5000], whole[:-30], *foreign):
-        assert "expected a torch" in _refusal(_write(tmp_path / "net.pth", content), load_msg_weights, 4)
+    path = tmp_path / "net.caffemodel"
     for content in (b"\xff" * 11, b"\xa2\x06\xff\xff\xff\xff\x0f\x00", b"\x0b", b"\xa0\x06\x01", _field(1, b"name")):
         assert "expected a torch or Caffe model" in _refusal(_write(path, content), load_msg_weights, 4)
     whole = caffemodel(caffe_layers(MSGNet(2, "hui")))
@@ -329,10 +316,3 @@ def test_other_files_are_refused(mirror, stripped, capsys):
     place.parent.mkdir(exist_ok=True, parents=True)
     place.write_bytes(b"others")
     assert weights.packaged_weights(NAME) is None
-
-
-@pytest.mark.usefixtures("stripped")
-def test_without_a_mirror_there_is_no_address_in_one_line(capsys):
-    assert main(["data", "get", "weights"]) == 2
-    [line] = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"error: weights/{NAME}.safetensors: no address of it is known")

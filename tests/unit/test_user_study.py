@@ -192,17 +192,6 @@ def test_invalid_answer_file_is_left_out_with_one_line_that_names_it(tmp_path):
         assert "\n" not in line
 
 
-def test_missing_file_picture_and_file_of_many_megabytes_are_left_out(tmp_path):
-    picture, large = tmp_path / "picture.json", tmp_path / "large.json"
-    picture.write_bytes(b"\x89PNG\r\n\xff\xfe")
-    with large.open("wb") as file:
-        file.truncate(20_000_000)
-    given, left_out = read_all([tmp_path / "none.json", picture, large], KEY)
-    assert given == []
-    assert [line.partition(": ")[0] for line in left_out] == [str(tmp_path / "none.json"), str(picture), str(large)]
-    assert "20000000" in left_out[2]
-
-
 def test_answers_with_a_byte_order_mark_are_read(tmp_path):
     file = tmp_path / "mailed.json"
     file.write_text(json.dumps(FOUR[0]) + "\r\n", encoding="utf-8-sig")
@@ -304,16 +293,6 @@ def test_scene_of_one_method_alone_is_left_out_and_incomplete_ones_are_noted(tmp
     assert {trial.scene for trial in built.key.trials.values()} == {"cube_no_texture", "<_script><b>statue"}
     assert any("alone x4 box: only Bicubic has a prediction" in note for note in built.notes)
     assert any("without DIP" in note for note in built.notes)
-
-
-def test_scene_with_fewer_than_two_predictions_that_can_be_read_is_left_out_with_their_files(tmp_path, runs):
-    damaged = [runs / f"folder_of_{method}" / "predictions" / "cube_no_texture.npz" for method in ("msg_v", "dip")]
-    for path in damaged:
-        path.write_bytes(b"no prediction")
-    built = build_study(load_results([runs]), tmp_path / "study")
-    assert [trial.scene for trial in built.key.trials.values()] == ["<_script><b>statue"]
-    [note] = [note for note in built.notes if note.startswith("left out")]
-    assert all(str(path) in note for path in damaged)
 
 
 @pytest.mark.parametrize(

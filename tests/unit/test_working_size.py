@@ -102,12 +102,6 @@ def test_evaluation_works_on_a_sensor_map_at_the_size_that_upsample_chooses():
     assert select(read_recipe("facets", {"noise": 0}), 1, measured=True).direct
 
 
-def test_notes_of_an_evaluation_name_a_smaller_size_only():
-    method = select(read_recipe("facets"), 1, measured=True).build(Run())
-    notes = [method.describe(DepthSample("set", "room", GREY, noisy(width), CAMERA, CAMERA, 1)) for width in (20, 3)]
-    assert notes == ["480 x 640 depth to 480 x 640 by facets x1, worked on at 1/8", ""]
-
-
 def test_weights_of_a_sensor_map_belong_to_the_run(tmp_path):
     files = select(read_recipe("facets"), 1, measured=True).files()
     assert {"facets_x2", "facets_x4", "facets_x8", "facets_x16"} <= {file.stem for file in files}
