@@ -18,7 +18,7 @@ from dsr.methods.base import MapNoise
 # pixels of the map from a window's centre to its border, in averages of the residual, which are taken twice; and of
 # their power
 _REACHES, _AROUND = (12, 3), 24
-_OUTLIER = 4.0  # standard deviations of the noise from which on a residual is of a depth step or an outlier
+_OUTLIER = 8.0  # standard deviations of the noise from which on a residual is of a depth step or an outlier
 _MOST = 0.5  # of the inverse depth that may be taken away
 _FARTHER = 8.0  # times the distance at which the noise was estimated, up to which it grows
 

@@ -2,7 +2,8 @@
 
 By RealSense's recursion, m = alpha x + (1 - alpha) m, white noise of deviation s becomes s sqrt(alpha / (2 - alpha)). A
 pixel begins anew where it differs from the mean by more than a few expected errors, and beside a change of colour.
-Expected errors grow to the differences that occur, so that pixels with more noise than expected are averaged, too.
+Expected errors grow to the differences that occur, so that pixels with more noise than expected are averaged, too. They
+grow faster than they shrink, because a camera's first frames would flicker until they have grown.
 """
 
 import torch
@@ -16,7 +17,7 @@ from dsr.methods.classical.realsense import follow
 _CHANGE = 5.0  # expected errors
 _COLOUR = 0.05  # change of a mean over 3 x 3 pixels: five deviations if those of the photo's noise are 5 of 255
 _REACH = 2  # pixels around a change of colours within which depth changes with it
-_RATE = 0.2  # weight of a frame's difference in the mean difference
+_GROWTH, _DECAY = 0.4, 0.2  # weight of a frame's difference in the mean difference, where it is larger and smaller
 KEPT = 8  # results that a mean depends on where the last of them have holes
 
 
@@ -61,7 +62,8 @@ class Steady:
         seen = window_maxima(colours.abs().amax(0, keepdim=True), _REACH).to(depth.device) > 9 * _COLOUR
         off = (inverse - mean).abs() * depth.square()  # in metres; NaN in holes and where there is no mean
         limit = _CHANGE * torch.fmax(error, self._error)
-        spread = torch.fmax(error, self._error.lerp(torch.minimum(off, limit), _RATE))
+        rate = torch.where(off > self._error, _GROWTH, _DECAY).to(off)
+        spread = torch.fmax(error, self._error.lerp(torch.minimum(off, limit), rate))
         return surface._replace(
             depth=follow(inverse, mean, (off < limit) & ~seen, self._alpha).reciprocal(),
             depth_error=torch.where(seen | off.isnan(), error, spread),

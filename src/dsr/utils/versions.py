@@ -14,7 +14,7 @@ from dsr.utils.guards import opened
 from dsr.utils.progress import Task
 
 DISTRIBUTION = "depthsr"  # the name in pyproject.toml; the dsr of PyPI is another project
-RESULTS = 8
+RESULTS = 9
 """Version of what predicts and trains, raised with each change of its results, so that older predictions are not used
 again. ``tests/golden/test_results.py`` notices such a change."""
 SCENES = 1
