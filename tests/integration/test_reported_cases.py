@@ -325,16 +325,12 @@ def unread(path: Path):
     elif path.suffix == ".exr":
         with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"RGB": linear}) as file:
             file.write(str(path))
-    elif path.suffix == ".hdr":
-        cv2.imwrite(str(path), linear)
     else:
         Image.fromarray(photo).save(path)
     return path
 
 
-@pytest.mark.parametrize(
-    "name", ["half.tif", "photo.tif", *(f"photo.{end}" for end in ["npy", "exr", "hdr", "gif", "jp2", "avif"])]
-)
+@pytest.mark.parametrize("name", ["half.tif", "photo.tif", *(f"photo.{end}" for end in ["npy", "exr", "gif", "avif"])])
 def test_formats_that_are_not_read_are_not_called_damaged(tmp_path, capsys, name):
     path, depth = unread(tmp_path / name), write(tmp_path / "depth.png", millimetres(coarse(scene()[0])))
     files = (path, None) if name == "half.tif" else (depth, path)
@@ -376,46 +372,30 @@ def test_a_negative_depth_map_is_called_negative(tmp_path, capsys, name, options
 
 
 @pytest.mark.parametrize(
-    ("runs", "shared", "seeds"),
+    ("runs", "shared"),
     [
-        ([("One", 0, "abc"), ("One", 0, "ab"), ("Two", 0, "ab")], "ab", 1),
-        ([("One", 0, "ab"), ("One", 1, "abc"), ("Two", 0, "abc")], "abc", 1),
-        ([("One", 0, "ab"), ("One", 1, "abc"), ("Two", 0, "ab")], "ab", 2),
-        ([("One", 0, "ab"), ("One", 1, "bc"), ("Two", 0, "bc")], "bc", 1),
-        ([("One", 0, "a"), ("Two", 0, "bc")], "", 1),
+        ([("One", 0, "ab"), ("One", 1, "abc"), ("Two", 0, "abc")], "abc"),
+        ([("One", 0, "ab"), ("One", 1, "bc"), ("Two", 0, "bc")], "bc"),
+        ([("One", 0, "a"), ("Two", 0, "bc")], ""),
     ],
 )
-def test_report_averages_over_the_scenes_that_all_methods_have(make_run, tmp_path, runs, shared, seeds):
+def test_page_table_and_ranking_average_over_the_scenes_that_all_methods_have(make_run, tmp_path, runs, shared):
     for number, (label, seed, scenes) in enumerate(runs):
         make_run(tmp_path / str(number), label=label, seed=seed, scenes=tuple(scenes))
     results = load_results([tmp_path])
     page = problem_data(results, results.problems()[0])
-    average = build_tables(results)[-1].groups[-1]
-    for method, mean, row in zip(("One", "Two"), page["means"], average.rows, strict=True):
+    for method, mean, row in zip(("One", "Two"), page["means"], build_tables(results)[-1].groups[-1].rows, strict=True):
         own = {each["scene"]: each["values"]["RMSE_d"][0] for each in page["rows"] if each["method"] == method}
-        cell = row.cells["RMSE_d"]
-        assert mean["counts"].get("RMSE_d", len(page["scenes"])) == cell.scenes == len(shared)
-        assert mean["seeds"] == row.seeds == (seeds if method == "One" else 1)
-        assert (cell.spread is None) == (row.seeds == 1)
-        if shared:
-            expected = pytest.approx(np.mean([own[scene] for scene in shared]))
-            [place] = [each for each in standings(results) if each["method"] == method]
-            assert mean["values"]["RMSE_d"][0] == cell.mean == place["values"]["RMSE_d"][0] == expected
-        else:
-            assert mean["values"] == {}
+        found = [each["values"]["RMSE_d"][0] for each in standings(results) if each["method"] == method and shared]
+        found += [row.cells["RMSE_d"].mean, mean["values"]["RMSE_d"][0]] if shared else []
+        assert all(each == pytest.approx(np.mean([own[scene] for scene in shared])) for each in found)
+        assert bool(mean["values"]) == bool(shared)
 
 
 def test_nobody_is_sent_to_the_dsr_of_pypi(monkeypatch):
     root = Path(__file__).resolve().parents[2]
-    texts = [
-        path
-        for name in ("src", "conf", "docs")
-        for kind in ("py", "md", "yaml")
-        for path in (root / name).rglob(f"*.{kind}")
-    ]
-    found = [str(path) for path in (*texts, root / "README.md") if re.search(r"\bdsr\[[a-z]+[],]", path.read_text())]
-    assert len(texts) > 400
-    assert found == []
+    pages = [root / "README.md", *(root / "docs").rglob("*.md"), *(root / "src").rglob("*.py")]
+    assert [page for page in pages if re.search(r"\bdsr\[[a-z]+[],]", page.read_text())] == []
     name = tomllib.loads((root / "pyproject.toml").read_text())["project"]["name"]
     assert (name, distribution(name).version) == (versions.DISTRIBUTION, versions.package_versions()["dsr"])
     assert "pip install -e '.[mesh]'" in versions.how_to_install("mesh")
@@ -525,18 +505,19 @@ EXTRINSICS = ("/camera/extrinsics/depth_to_color", (0.03, 0, 0))
 
 
 @pytest.mark.parametrize(
-    ("version", "plugin", "transforms", "extrinsics"),
-    [(2, "SQLITE3", TREE, None), (2, "MCAP", TREE, None), (1, "", TREE, None), (2, "MCAP", (), EXTRINSICS),
-     (1, "", (), EXTRINSICS)],
+    ("version", "plugin", "transforms", "extrinsics", "focal"),
+    [(2, "SQLITE3", TREE, None, 96.0), (2, "SQLITE3", TREE, None, 144.0), (2, "MCAP", TREE, None, 96.0),
+     (1, "", TREE, None, 96.0), (2, "MCAP", (), EXTRINSICS, 96.0), (1, "", (), EXTRINSICS, 96.0)],
 )  # fmt: skip
 def test_unregistered_depth_of_a_recording_is_warped_by_its_transform(
-    tmp_path, version, plugin, transforms, extrinsics
+    tmp_path, version, plugin, transforms, extrinsics, focal
 ):
+    """A focal length of 144 is that of the photo, as if the two were registered."""
     truth, photo = scene()
-    apart = millimetres(scene(160, 120, 96.0, shift=0.03)[0])
+    apart = millimetres(scene(160, 120, focal, shift=0.03)[0])
     pictures = {
         "/camera/color/image_raw": (photo, COLOUR, PHOTO_INFO),
-        "/camera/depth/image_rect_raw": (apart, DEPTH, DEPTH_INFO),
+        "/camera/depth/image_rect_raw": (apart, DEPTH, (focal, *DEPTH_INFO[1:])),
     }
     bag = tmp_path / "a.bag" if version == 1 else tmp_path / "a"
     write_bag(bag, pictures, transforms, version=version, plugin=plugin, extrinsics=extrinsics)
@@ -545,19 +526,6 @@ def test_unregistered_depth_of_a_recording_is_warped_by_its_transform(
     error, known = lr_error(picture, cv2.resize(truth, (width, height), interpolation=cv2.INTER_AREA))
     assert error < 25
     assert known > 0.9
-
-
-def test_depth_of_another_place_is_warped_though_its_camera_is_alike(tmp_path):
-    truth, photo = scene()
-    apart = millimetres(scene(160, 120, 144.0, shift=0.03)[0])
-    pictures = {
-        "/camera/color/image_raw": (photo, COLOUR, PHOTO_INFO),
-        "/camera/depth/image_rect_raw": (apart, DEPTH, (144.0, 79.5, 59.5, 160, 120)),
-    }
-    write_bag(tmp_path / "a", pictures, TREE)
-    picture = read(tmp_path / "a")
-    height, width = picture.depth_lr.shape[1:]
-    assert lr_error(picture, cv2.resize(truth, (width, height), interpolation=cv2.INTER_AREA))[0] < 25
 
 
 def test_depth_that_is_aligned_to_another_camera_is_not_registered(tmp_path):
@@ -732,12 +700,7 @@ def test_scene_that_is_exported_to_nerfstudio_is_read_again(tmp_path):
     write(tmp_path / "in" / "rgb.png", photo)
     write(tmp_path / "in" / "depth.png", millimetres(coarse(truth)))
     options = ("--rgb", tmp_path / "in" / "rgb.png", "--depth", tmp_path / "in" / "depth.png", *CAMERA)
-    assert (
-        main(
-            ["upsample", *map(str, options), "-o", str(tmp_path / "out"), "--method", "bicubic", "--with", "nerfstudio"]
-        )
-        == 0
-    )
+    assert upsample(tmp_path / "out", *options, "--with", "nerfstudio") == 0
     for place in (tmp_path / "out", tmp_path / "out" / "nerfstudio"):
         picture = read(place)
         camera = picture.camera
@@ -1117,8 +1080,6 @@ def test_argument_leads_to_the_one_that_is_meant(command, arguments, meant):
     ("alignment", "make", "given"),
     [
         ("affine_disparity", lambda depth: 17 * (1 / depth - 0.2), ["method.range_type=inverse"]),
-        pytest.param("affine", lambda depth: 40 * depth + 3, [], marks=pytest.mark.nightly),
-        pytest.param("scale", lambda depth: 9 * depth, [], marks=pytest.mark.nightly),
         ("robust", lambda depth: np.round(1000 * depth).astype(np.uint16), []),
     ],
 )
@@ -1214,8 +1175,7 @@ def warnings_of(out: Path):
     return {each["code"]: each["message"] for each in json.loads((out / "info.json").read_text())["warnings"]}
 
 
-@pytest.mark.parametrize("by", [pytest.param(2, marks=pytest.mark.nightly), 4])
-@pytest.mark.parametrize("ratio", [0.7, 0.85, 1.0, 1.3, 1.5])
+@pytest.mark.parametrize(("ratio", "by"), [(0.7, 4), (0.85, 2), (1.0, 4), (1.5, 4)])
 def test_another_field_of_view_is_reported(tmp_path, ratio, by):
     depth, photo = scene()
     (height, width), cut = (round(each * min(ratio, 1 / ratio) / 4) * 4 for each in (HEIGHT, WIDTH)), max(ratio, 1)
@@ -1229,7 +1189,6 @@ def test_another_field_of_view_is_reported(tmp_path, ratio, by):
     assert set(found) == ({"field-of-view"} if ratio != 1 else set())
     if ratio != 1:
         assert float(re.findall(r"looks ([\d.]+) times", found["field-of-view"])[0]) == pytest.approx(ratio, rel=0.1)
-        assert upsample(tmp_path / "strict", *files, *CAMERA, "--strict") == 2
 
 
 @pytest.mark.parametrize(("sign", "apart"), [(1, 0.1), (-1, 0.1), (1, -0.25), (-1, -0.25)])
