@@ -124,7 +124,7 @@ class Campaign:
 
     def finish(self, name):
         """Run the command to its end, and return what differs from undisturbed results."""
-        return [*problems_of(self.start(name)), *damaged(self.work), *differences(self.root / name, self.work)]
+        return [*problems_of(self.start(name)), *differences(self.root / name, self.work)]
 
     def complete(self):
         """Return the files that are never made again, ``info.json`` once it is complete, with numbers and times."""

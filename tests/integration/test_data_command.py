@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import cv2
 import pytest
@@ -118,10 +117,6 @@ def test_unknown_name_is_one_line_with_the_known_ones(root, capsys):
         line = refused_line(capsys, cli.main(["data", task, "middelbury"]))
         assert line.startswith("middelbury: unknown data set; expected some of middlebury, ")
     assert not root.exists()
-
-
-REPOSITORY = Path(__file__).resolve().parents[2]
-QUICK = ("metrics.lpips=false", "device=cpu")
 
 
 def test_prepare_draws_a_contact_sheet_and_errors_are_one_line(tmp_path, monkeypatch, capsys, shared, dsr_cache):
