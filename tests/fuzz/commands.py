@@ -19,7 +19,6 @@ from small_files import written
 from dsr.app.entry import run_eval, run_train
 from dsr.cli import main
 from dsr.report.study.files import write_key
-from dsr.report.study.percentages import COLUMNS
 from dsr.training.module import SuperResolution
 from dsr.utils.configuration import config_directories
 from fuzz.judging import Place, RefusedError
@@ -41,14 +40,9 @@ def _quietly(*arguments: object) -> None:
 
 
 def runs(folder: Path) -> None:
-    """Write two runs of ``eval.py``, one of a method that expects errors, and a table of a study of them."""
+    """Write two runs of ``eval.py``, one of a method that expects errors."""
     write_run(folder / "bicubic")
     write_run(folder / "facets", method="facets", label="Facets", confident=True)
-    rows = [",".join(COLUMNS)]
-    for label, method in (("Bicubic", "bicubic"), ("Facets", "facets")):
-        values = ["30", "20", "50", "12", *["10", "60"] * 3]
-        rows.append(",".join(["simgeo", "cube_no_texture", "4", "box", method, label, *values]))
-    (folder / "study.csv").write_text("\n".join(rows) + "\n")
 
 
 @functools.cache
@@ -139,18 +133,16 @@ def _hydra(name: str, *arguments: str) -> None:
         raise RefusedError([re.sub(r"^([a-z_]+(\.\w+)*: )", r"input/ \1", line) for line in refused.lines]) from refused
 
 
-def _report(*options: str) -> Reader:
+def _report(parts: str) -> Reader:
     def read(place: Place) -> None:
-        given = [each.format(place.input) for each in options]
-        command("report", place.input, "-o", place.out / "report", "--only", *given)
+        command("report", place.input, "-o", place.out / "report", "--only", parts)
 
-    return Reader(f"report {options[0]}", runs, read, 1)
+    return Reader(f"report {parts}", runs, read, 1)
 
 
 COMMANDS = (
     _report("tables,metrics"),
     _report("figures,page"),
-    _report("tables", "--study", "{}/study.csv"),
     Reader("study build", runs,
            lambda place: command("study", "build", place.input, "-o", place.out / "study", "--light", "e1"), 1),
     Reader("study collect", study, lambda place: command(

@@ -4,8 +4,6 @@ import contextlib
 import io
 import os
 import signal
-import sys
-import tempfile
 import time
 import traceback
 import warnings
@@ -22,7 +20,6 @@ from fuzz.guard import MARK, watching
 
 SECONDS, MEMORY = 20.0, 2 << 30  # Limits of a case: seconds of computing, and bytes, as commands limit their memory
 _WAITING = 60.0  # Seconds that a case may take on a machine that does much else
-_LONGEST_LINE = 1000
 _SHORTEST_NAME = 3  # Names of fewer letters are found in any message
 REFUSALS = (ValueError, OSError)  # What the commands turn into a line
 _SILENT = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)  # Python shows users none
@@ -67,7 +64,8 @@ def judge(read: Callable[[Place], Any], place: Place) -> Outcome:
     names, started = _names(place), time.process_time()
     problems, lines = list[str](), list[str]()
     with (
-        _captured() as printed,
+        contextlib.redirect_stdout(io.StringIO()),
+        contextlib.redirect_stderr(io.StringIO()),
         watching(place.input, place.out) as watch,
         warnings.catch_warnings(record=True) as reported,
     ):
@@ -90,10 +88,7 @@ def judge(read: Callable[[Place], Any], place: Place) -> Outcome:
     problems += [f"does what a reader must not: {each}" for each in watch.seen[:3]]
     problems += [f"leaves {name!r} beside its folders" for name in left]
     problems += [f"warns: {each.message!s:.200}" for each in reported if not issubclass(each.category, _SILENT)][:2]
-    problems += [f"prints {each:.200}" for each in printed]
     for line in lines:
-        if len(line) > _LONGEST_LINE:
-            problems.append(f"a line of {len(line)} characters: {line[:200]}")
         if "not enough memory" not in line and not any(name in line for name in names):
             problems.append(f"names no file: {line[:300]}")
         if line != printable(line) or "\n" in line:
@@ -135,25 +130,3 @@ def _limited() -> Iterator[None]:
         for (number, timer, _), handler in zip(limits, before, strict=True):
             signal.setitimer(timer, 0)
             signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def _captured() -> Iterator[list[str]]:
-    """Return the list of what libraries print on the file descriptors in the block; what Python prints is dropped."""
-    found: list[str] = []
-    sys.stdout.flush()
-    sys.stderr.flush()
-    with tempfile.TemporaryFile() as file:
-        kept = os.dup(1), os.dup(2)
-        os.dup2(file.fileno(), 1)
-        os.dup2(file.fileno(), 2)
-        try:
-            with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-                yield found
-        finally:
-            for number, descriptor in enumerate(kept, 1):
-                os.dup2(descriptor, number)
-                os.close(descriptor)
-            file.seek(0)
-            text = file.read(4000).decode(errors="replace").strip()
-            found += [text] if text else []

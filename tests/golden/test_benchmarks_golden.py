@@ -66,13 +66,11 @@ def _source(shared, benchmark, images):
     return EightBit(root, "lu" if benchmark == "Lu" else "middlebury8", images), "disparity"
 
 
-def _rmse(source, kind, method, scale, multiple=1):
-    """Return the RMSE of each image, cropped to a multiple, in the benchmark's unit."""
+def _rmse(source, kind, method, scale):
+    """Return the RMSE of each image in the benchmark's unit."""
     found = {}
     for name in source.scenes():
-        scene = source.load(name)
-        height, width = (n // multiple * multiple for n in (scene.camera.height, scene.camera.width))
-        sample = make_sample(scene.crop(0, 0, height, width), scale, Downsampling("bicubic"), kind)
+        sample = make_sample(source.load(name), scale, Downsampling("bicubic"), kind)
         maps, metrics = (method(sample).double(), sample.depth.double()), catalogue(protocols=("field",))
         rows = score_image(*maps, sample.camera.rays(), metrics, sample.unit)
         found[name] = next(row.value for row in rows if row.metric in ("RMSE_levels", "RMSE_cm"))
@@ -88,22 +86,10 @@ def test_bicubic_has_the_errors_of_the_fields_protocol(shared, benchmark, scale)
     assert _rmse(source, kind, CubicConvolution(kind), scale) == pytest.approx(expected, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("method", "benchmark", "image", "scale", "multiple", "tolerance"),
-    [
-        ("DCTNet", "Lu", "RGBD_03", 8, 1, 1e-4),  # at 4 its depth is compared in test_peers_golden
-        # of PGSR the published errors take the range of the image before its crop
-        pytest.param("PGSR", "Lu", "RGBD_01", 4, 16, 3e-3, marks=pytest.mark.nightly),
-        pytest.param("PGSR", "Middlebury", "Middlebury_02", 8, 16, 3e-3, marks=pytest.mark.nightly),
-        pytest.param("PGSR", "RGBDD", "20200518161728", 4, 16, 3e-3, marks=pytest.mark.nightly),
-    ],
-)
-def test_networks_have_their_authors_errors_with_the_true_range(
-    shared, method, benchmark, image, scale, multiple, tolerance
-):
-    source, kind = _source(shared, benchmark, (image,))
-    recipe = read_recipe(method.lower(), {"range": "truth", "range_type": kind})
-    upsampler = recipe.with_weights(shared / "weights" / "peers").build(scale)
+def test_network_has_its_authors_errors_with_the_true_range(shared):
+    source, kind = _source(shared, "Lu", ("RGBD_03",))
+    recipe = read_recipe("dctnet", {"range": "truth", "range_type": kind})
+    upsampler = recipe.with_weights(shared / "weights" / "peers").build(8)  # at 4 its depth is in test_peers_golden
     assert upsampler.flag == "true-range"
-    expected = {image: _published(shared, benchmark, method, scale)[image]}
-    assert _rmse(source, kind, upsampler, scale, multiple) == pytest.approx(expected, rel=tolerance)
+    expected = {"RGBD_03": _published(shared, "Lu", "DCTNet", 8)["RGBD_03"]}
+    assert _rmse(source, kind, upsampler, 8) == pytest.approx(expected, rel=1e-4)

@@ -97,27 +97,6 @@ def test_training_of_the_documentation_composes(arguments: list[str]) -> None:
         assert TrainConfig.of(config).scale in (4, 8)
 
 
-def test_command_reference_has_every_command_and_option(hook: ModuleType, generated: dict[str, str]) -> None:
-    page = generated["reference/commands.md"]
-    parsers = list(hook.all_parsers(hook.command_parser()))
-    assert {"dsr", "dsr upsample", "dsr data get", "dsr study collect"} <= {parser.prog for parser in parsers}
-    for parser in parsers:
-        section = page.partition(f"\n## {parser.prog}\n")[2].partition("\n## ")[0]
-        for action in parser._actions:
-            assert [name for name in action.option_strings if name not in section] == []
-
-
-def test_configuration_reference_has_a_section_for_every_file(generated: dict[str, str]) -> None:
-    page, conf = generated["reference/configuration.md"], ROOT / "conf"
-    for path in conf.glob("*/**/*.yaml"):
-        group = path.parent.relative_to(conf).as_posix()
-        heading = f"\n### {group}={path.stem} {{ #{group.replace('/', '-')}-{path.stem} }}\n"
-        section = page.partition(heading)[2].partition("\n##")[0]
-        keys = [key for key in yaml.safe_load(path.read_text()) or () if key not in ("defaults", "hydra")]
-        # a row of a table, `key` or `key.of.a.node`; an experiment's lines stand as they are
-        assert [key for key in keys if not re.search(rf"^(\| `)?{key}\b", section, re.MULTILINE)] == [], path
-
-
 def test_citation_names_the_version_of_the_package() -> None:
     import dsr  # noqa: PLC0415
 

@@ -80,23 +80,16 @@ def test_points_for_splatting_are_pixels_that_are_expected_to_be_right(capture, 
     assert (out / "gaussian/sparse/0/points3D.bin").read_bytes()[:8] == struct.pack("<Q", certain)
 
 
-def test_foreign_file_in_place_of_an_export_is_left_alone(capture, tmp_path, capsys):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "open3d").write_text("mine")
-    code = upsample(capture, "--only", "open3d", "-o", out)
-    assert "open3d: is there already and not of an earlier run" in refused_line(capsys, code)
-    assert (out / "open3d").read_text() == "mine"
-
-
-def test_foreign_folder_beside_the_files_of_an_older_export_is_left_alone(capture, poses, tmp_path, capsys):
-    out, options = tmp_path / "out", ("--only", "nerfstudio", "--method", "bicubic", *poses)
-    (out / "normals_from_pretrain").mkdir(parents=True)
+@pytest.mark.parametrize("name", ["open3d", "normals_from_pretrain"])
+def test_foreign_file_or_folder_in_place_of_an_export_is_left_alone(capture, poses, tmp_path, capsys, name):
+    """Also beside the files of an older export."""
+    out, options = tmp_path / "out", ("--only", "open3d,nerfstudio", "--method", "bicubic", *poses)
+    (out / name).mkdir(parents=True)
+    (out / name / "thesis.txt").write_text("mine")
     (out / "transforms.json").write_text("{}")
     (out / "exports.json").write_text(json.dumps({"exports": {"transforms.json": ["transforms.json"]}}))
-    code = upsample(capture, *options, "-o", out)
-    assert "normals_from_pretrain: is there already and not of an earlier run" in refused_line(capsys, code)
-    assert upsample(capture, *options, "--overwrite", "-o", out) == 0
+    assert f"{name}: is there already" in refused_line(capsys, upsample(capture, *options, "-o", out))
+    assert (out / name / "thesis.txt").read_text() == "mine"
 
 
 def test_mesh_and_cloud_beyond_limits_are_said_and_recorded(capture, tmp_path, capsys):

@@ -103,9 +103,7 @@ def home(tmp_path_factory, dsr_cache):
 
 
 def test_eval_shows_a_metric_from_outside_with_its_unit_and_direction(home):
-    text = (home / "blend.txt").read_text()
-    assert "lower is better, of PSNR, Bright higher" in text
-    assert re.search(r"Bump_d\s+RMSE_v\s+PSNR\s+Bright", text)
+    assert "lower is better, of PSNR, Bright higher" in (home / "blend.txt").read_text()
     scores = pd.read_csv(home / "runs" / "blend" / "scores.csv", keep_default_na=False)
     assert (set(scores["method"]), set(scores["scene"])) == ({"blend"}, {"long", "short"})
     worst = scores[scores["metric"] == "Brightness"].pivot(index="scene", columns="variant", values="value")
@@ -124,11 +122,7 @@ def test_report_elsewhere_shows_it_after_the_papers_and_ranks_by_its_direction(h
     report = tmp_path / "report"
     table = pd.read_csv(report / "tables" / "waves_x4_box.csv")
     of_long = table[table["scene"] == "long"].set_index("method")["PSNR_d [dB]"]
-    text = (report / "tables" / "waves_x4_box.md").read_text()
-    heading = text.splitlines()[2]
-    assert heading.index("RMSE_v (1/1000)") < heading.index("PSNR (dB)") < heading.index("Bright (%)")
-    assert f"**{of_long.max():.1f}**" in text
-    assert "Lower is better, of PSNR, Bright higher." in text
+    assert f"**{of_long.max():.1f}**" in (report / "tables" / "waves_x4_box.md").read_text()
     assert '{"id":"PSNR_d","name":"PSNR","unit":"dB","digits":1,"higher":true,' in (report / "index.html").read_text()
     assert "PSNR_d" in (report / "metrics" / "spearman.csv").read_text()
 
@@ -164,15 +158,10 @@ def test_changed_code_of_a_method_from_outside_makes_another_run(home):
 
 
 def test_methods_get_what_is_known_of_the_maps(home):
-    hinted = ("--config-dir", "my_conf", "method=hinted", "dataset=waves", "dataset.size=32", *QUICK)
-    choices = "${hydra:runtime.choices.downsampling}_${hydra:runtime.choices.noise}"
-    several = ("downsampling=box,bicubic", "noise=none,gaussian_multiplicative", f"output_dir=hinted/{choices}")
-    lines = output_of(home, EVAL, "-m", *hinted, *several).splitlines()
-    expected = ["box sharp True", "box sharp False", "bicubic sharp True", "bicubic sharp False"]
-    hints = [line.removeprefix("hints ") for line in lines if line.startswith("hints ")]
-    assert hints == 2 * expected  # a multirun checks its jobs first
-    given = ("method.edges=soft", "method.kernel=nearest", "output_dir=hinted/given")
-    assert "hints nearest soft True" in output_of(home, EVAL, *hinted, *given).splitlines()
+    hinted = (EVAL, "--config-dir", "my_conf", "method=hinted", "dataset=waves", "dataset.size=32", *QUICK)
+    given = ("method.edges=soft", "method.kernel=nearest")
+    for more, hints in ((("noise=gaussian_multiplicative",), "box sharp False"), (given, "nearest soft True")):
+        assert f"hints {hints}" in output_of(home, *hinted, *more, f"output_dir='hints/{hints}'").splitlines()
 
 
 def test_upsample_runs_a_method_from_outside_with_settings(home):

