@@ -126,7 +126,7 @@ def _find_in(folder: Path, root: Path) -> PairingResult:
             break
     else:
         listed = add_transforms(folder, PairingResult(())) or find_colmap(folder)
-        return listed or find_capture(folder, last=True) or found
+        return listed or find_capture(folder, fallback=True) or found
     camera = find_camera_file(folder, root)
     if camera is not None:
         found = replace(found, pairs=tuple(replace(pair, camera=pair.camera or camera) for pair in found.pairs))

@@ -230,7 +230,7 @@ CAPTURES = (
         of_file=partial(_call, "jpeg.read"),
         suffixes=(".jpg", ".jpeg"),
         mark=partial(_call, "jpeg.has_depth"),
-        last=True,
+        fallback=True,
     ),
     Capture(
         "COLMAP",
@@ -296,9 +296,9 @@ def all_captures() -> tuple[Capture, ...]:
     return (*others, *CAPTURES)
 
 
-def find_capture(place: Path, *, last: bool = False) -> PairingResult | None:
-    """Return the frames of a capture, a file or a folder, of those that are asked first or last; None if it is none."""
-    asked = (each for each in all_captures() if each.last == last or place.is_file())
+def find_capture(place: Path, *, fallback: bool = False) -> PairingResult | None:
+    """Return the frames of a capture, a file or a folder; None if it is none. Fallbacks are asked apart."""
+    asked = (each for each in all_captures() if each.fallback == fallback or place.is_file())
     return next((found for each in asked if (found := each.frames(place)) is not None), None)
 
 

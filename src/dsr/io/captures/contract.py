@@ -33,7 +33,7 @@ class Capture:
         of_file: returns the frames of a file with one of the ``suffixes``.
         suffixes: of captures that are a single file, in lower case; a folder may have several of them.
         mark: tells such a file from others of its suffix; any file by default.
-        last: whether a folder is asked only if its files make no pairs, as of photos with depth maps beside them.
+        fallback: whether a folder is asked only if its files make no pairs, as of photos with depth maps beside them.
         marks: patterns of paths below its folder, any of which distinguishes it from others; ``*`` in the last part
             stands for anything. Empty for single files, and for layouts without characteristic names.
         needs: patterns of its parts, alternatives as ``A or B``; those that match nothing are named to the user of a
@@ -52,7 +52,7 @@ class Capture:
     of_file: Callable[[Path], PairingResult] | None = None
     suffixes: tuple[str, ...] = ()
     mark: Callable[[Path], bool] = lambda _: True
-    last: bool = False
+    fallback: bool = False
     marks: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()
 
@@ -63,7 +63,7 @@ class Capture:
             if of_file is None or place.suffix.lower() not in self.suffixes:
                 return None
             if not self.mark(place):
-                if self.last:
+                if self.fallback:
                     return None
                 raise ValueError(f"{place}: expected {self.name}, got another {place.suffix} file")
             return of_file(place)
