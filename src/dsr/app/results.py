@@ -3,13 +3,14 @@
 import itertools
 import math
 import webbrowser
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 from rich.console import Console
+from torch import Tensor
 
 from dsr.app.requests import FuseRequest, ViewRequest
 from dsr.app.upsample.parts import ERRORS
@@ -126,8 +127,14 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
     size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, voxels of {show_length(voxel)}"
     show(console, f"{_count(frames)} -> {request.output}: {size}; in {frame}")
     if request.score:
-        show(console, f"successive results differ by {_difference(frames, max_error)} (OPW)")
-        show(console, f"distances of points spread by {_spread(recordings.values(), max_error)} of their mean (RSD)")
+        from dsr.metrics.temporal import opw, rsd  # noqa: PLC0415 - torchmetrics, which takes a second
+
+        known = _scores(recordings.values(), max_error, opw, 2, 1)
+        mean = show_length(float(np.mean(known))) if known else "nan"
+        show(console, f"successive results differ by {mean}, {len(known)} pairs of a view in common (OPW)")
+        known = _scores(recordings.values(), max_error, rsd, _VIEWS, _VIEWS)
+        spread = f"{100 * np.mean(known):.2f} %" if known else "nan"
+        show(console, f"distances of points spread by {spread} of their mean (RSD)")
     return problems
 
 
@@ -144,34 +151,18 @@ def _count(results: Sequence[object]) -> str:
     return "1 result" if len(results) == 1 else f"{len(results)} results"
 
 
-def _difference(frames: Sequence[Path], max_error: float) -> str:
-    """Return the mean difference of successive results of each recording, with its unit and how many pairs it is of."""
-    from dsr.metrics.temporal import opw  # noqa: PLC0415 - torchmetrics, which takes a second
-
-    found = []
-    for pair in itertools.pairwise(frames):
-        first, second = (_load(folder, max_error) for folder in pair)
-        if pair[0].parent == pair[1].parent and first.camera == second.camera:
-            depths = torch.from_numpy(np.stack((first.depth, second.depth)))[:, None]
-            found.append(float(opw(depths, first.camera, (first.pose, second.pose))))
-    known = [each for each in found if not math.isnan(each)]
-    mean = show_length(float(np.mean(known))) if known else "nan"
-    return f"{mean}, {len(known)} pairs of a view in common"
-
-
-def _spread(recordings: Iterable[Sequence[Path]], max_error: float) -> str:
-    """Return the mean spread of distances over a few successive views each, in per cent."""
-    from dsr.metrics.temporal import rsd  # noqa: PLC0415 - as above
-
+def _scores(
+    recordings: Iterable[Sequence[Path]], max_error: float, metric: Callable[..., Tensor], views: int, step: int
+) -> list[float]:
+    """Return a metric of each group of so many successive results of one camera, where it has a value."""
     found = []
     for recording in recordings:
-        for start in range(0, len(recording), _VIEWS):
-            views = [_load(folder, max_error) for folder in recording[start : start + _VIEWS]]
-            if len(views) > 1 and len({view.camera for view in views}) == 1:
-                depths = torch.from_numpy(np.stack([view.depth for view in views]))[:, None]
-                found.append(float(rsd(depths, views[0].camera, [view.pose for view in views])))
-    known = [each for each in found if not math.isnan(each)]
-    return f"{100 * np.mean(known):.2f} %" if known else "nan"
+        for start in range(0, len(recording) - 1, step):
+            group = [_load(folder, max_error) for folder in recording[start : start + views]]
+            if len({each.camera for each in group}) == 1:
+                depths = torch.from_numpy(np.stack([each.depth for each in group]))[:, None]
+                found.append(float(metric(depths, group[0].camera, [each.pose for each in group])))
+    return [each for each in found if not math.isnan(each)]
 
 
 def _load(folder: Path, max_error: float) -> PosedMap:

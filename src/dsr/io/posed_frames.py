@@ -14,10 +14,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import quaternion_of, visible
+from dsr.geometry.poses import Matrix, quaternion_of, visible
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import whole_normals
 from dsr.io.images import read_pixels
@@ -42,7 +41,7 @@ class Frame:
 
     name: str  # perhaps with folders: kitchen/000012
     camera: Camera
-    pose: Tensor | None  # (4, 4) float64 camera to world in metres; None if it is not known
+    pose: Matrix | None  # (4, 4) camera to world in metres; None if it is not known
     colour: Path  # an 8-bit PNG
     depth: Path  # a file of (H, W) orthogonal depth in metres, NaN in holes
     up: str = ""  # the axis of the world that points up, one of dsr.io.frames.UPS
@@ -56,9 +55,9 @@ class Frame:
         return self.name.replace("/", "_")
 
     @property
-    def matrix(self) -> np.ndarray:
+    def matrix(self) -> Matrix:
         """The pose, (4, 4); a frame without one stands at the origin."""
-        return np.eye(4) if self.pose is None else self.pose.numpy()
+        return np.eye(4) if self.pose is None else self.pose
 
     def read_depth(self) -> np.ndarray:
         """Return the depth, (H, W) float32 in metres, NaN in holes."""

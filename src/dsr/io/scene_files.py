@@ -7,7 +7,7 @@ principal point from the corner of the image, half a pixel more.
 import importlib
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,7 +19,6 @@ from dsr.geometry.camera import Camera
 from dsr.io.exports import as_bytes, world_comment, write_normals, write_ply
 from dsr.io.photos import encode_png, to_jpeg, write_png
 from dsr.io.posed_frames import Frame, colmap_model, initial_gaussians, sample_points
-from dsr.io.trajectories import check_pose
 from dsr.notes import Assumption
 from dsr.utils.files import replacing, write_text
 from dsr.utils.guards import refusing
@@ -29,14 +28,6 @@ _Value = TypeVar("_Value")
 NORMALS = "normals_from_pretrain"  # a folder that dn-splatter looks for
 RGBD = ("color.png", "depth.png", "intrinsic.json")
 _MILLIMETRES, _STEPS = 1000, 65535  # of a metre, and of 16 bits
-
-
-def parse_pose(where: str, value: object) -> Tensor | None:
-    """Return a camera-to-world transform, (4, 4) float64, that JSON holds as a list of lists; None for none."""
-    if value is None:
-        return None
-    with refusing(f"{where}: expected a rigid transform of 4 x 4 numbers, got {value}", TypeError, ValueError):
-        return torch.from_numpy(check_pose(where, np.array(value, dtype=np.float64)))
 
 
 def _common(values: Sequence[_Value]) -> _Value | None:
@@ -52,16 +43,6 @@ def to_millimetres(depth: np.ndarray) -> tuple[np.ndarray, int]:
     values = np.rint(depth.astype(np.float64) * _MILLIMETRES)
     fits = (values > 0) & (values <= _STEPS)
     return np.where(fits, values, 0).astype(np.uint16), int((values > _STEPS).sum())
-
-
-def expect_poses(part: str, known: Mapping[str, bool]) -> None:
-    """Refuse frames, by name with whether they have a pose, of which one has none; a single one needs none."""
-    missing = [name for name, has in known.items() if not has]
-    if missing and len(known) > 1:
-        raise ValueError(
-            f"{part}: expected a pose of each frame, got none for {len(missing)} of {len(known)}, such as "
-            f"{missing[0]}; --poses gives them"
-        )
 
 
 def _write_pictures(
@@ -140,7 +121,6 @@ def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
     millimetres by default; ``depth_unit_scale_factor`` states it for other readers. dn-splatter finds normals by their
     folder, in the colours of :func:`dsr.io.exports.write_normals` (dn_splatter/data/dn_dataset.py, ``omnidata``).
     """
-    expect_poses("nerfstudio", {frame.name: frame.pose is not None for frame in frames})
     camera, folder = _common([frame.camera for frame in frames]), path.parent / "nerfstudio"
     points, (sampled, _) = folder / "points.ply", sample_points(frames)
     up = world_comment(_common([frame.up for frame in frames]) or "")
@@ -193,7 +173,6 @@ def write_splatting(folder: Path, frames: Sequence[Frame]) -> list[Path]:
     authors does, with ``--alpha_masks masks`` (its scene/cameras.py). The scene is COLMAP's binary model, which both
     look for first; a single frame without a pose has none.
     """
-    expect_poses("gaussian", {frame.name: frame.pose is not None for frame in frames})
     nearest = min(float(np.fmin.reduce(frame.read_depth(), axis=None, initial=np.inf)) for frame in frames)
     if not np.isfinite(nearest):
         raise ValueError("gaussian: expected some depth, got holes alone")

@@ -26,7 +26,6 @@ from dsr.inference.steady import KEPT, Steady
 from dsr.io.images import pixels_in_header
 from dsr.io.inputs import Picture, read_geometry, read_picture
 from dsr.io.pairs import Pair
-from dsr.io.scene_files import expect_poses
 from dsr.io.trajectories import USUAL_SIZE, read_poses
 from dsr.methods.base import MapNoise, Surface
 from dsr.methods.glass import NOTED
@@ -194,9 +193,13 @@ def _check_poses(request: UpsampleRequest, frames: Frames, console: Console) -> 
             with contextlib.suppress(ValueError, OSError):  # it is reported as a frame of its own
                 geometry, _ = read_geometry(pair, pixels_in_header(pair.rgb) or USUAL_SIZE, request.reading)
                 posed[pair.name] = geometry.pose is not None
+    missing = [name for name, has in posed.items() if not has]
     for part in parts:
-        expect_poses(part.name, posed)
-        if not all(posed.values()):  # a single one
+        if missing and len(posed) > 1:
+            count = f"{len(missing)} of {len(posed)}"
+            text = f"expected a pose of each frame, got none for {count}, such as {missing[0]}; --poses gives them"
+            raise ValueError(f"{part.name}: {text}")
+        if missing:
             show(console, f"--with {part.name}: the frame has no pose{_UNPOSED[part.name]}")
 
 

@@ -15,6 +15,7 @@ import torch
 from dsr.app.upsample.parts import ERRORS, METRES, Part, Results
 from dsr.evaluation.results import load_errors
 from dsr.geometry.camera import Camera
+from dsr.geometry.poses import as_rigid
 from dsr.inference.plausibility import find_filled
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import INPUT, read_input
@@ -22,7 +23,6 @@ from dsr.io.frames import UPS
 from dsr.io.scene_files import (
     RGBD,
     Frame,
-    parse_pose,
     write_open3d,
     write_rerun,
     write_splatting,
@@ -168,8 +168,6 @@ def read_depth(folder: Path, camera: Camera) -> np.ndarray:
     if stored.shape != size or stored.dtype != np.float32:
         text = f"{stored.dtype} of shape {stored.shape}"
         raise ValueError(f"{path}: expected float32 of shape {size}, the photo's, got {text}")
-    if min(size) < 2:
-        raise ValueError(f"{path}: expected a map of at least 2 x 2 pixels, got {size}")
     depth = np.where(np.isfinite(stored) & (stored > 0), stored, np.float32(math.nan))
     if not np.isfinite(depth).any():
         raise ValueError(f"{path}: expected depths, all pixels are holes")
@@ -201,7 +199,10 @@ def read_frame(name: str, folder: Path) -> Frame:
     depth, colour = folder / METRES, folder / "rgbd" / RGBD[0]
     if not (depth.is_file() and colour.is_file()):
         raise ValueError(f"{folder}: expected {METRES} and rgbd/{RGBD[0]} of this run, one is missing")
-    pose, time = parse_pose(f"{folder / INFO}: pose", info.get("pose")), info.get("time")
+    pose, time = info.get("pose"), info.get("time")
+    if pose is not None:
+        as_rigid(pose, f"{folder / INFO}: pose")
+        pose = np.vstack((np.array(pose, np.float64)[:3], (0, 0, 0, 1)))
     return Frame(
         name, read_camera(folder, info), pose, colour, depth, info["up"], time if is_number(time) else None,
         errors=folder / ERRORS if (folder / ERRORS).is_file() else None, max_error=_max_error(info),
