@@ -298,9 +298,6 @@ def undistort(picture: np.ndarray, camera: Camera, lens: Lens, hole: float | Non
 
     Without a ``hole``, it is a photo, which is interpolated, else a map: a pixel gets the value of the nearest one.
     """
-    if picture.shape[:2] != (camera.height, camera.width) or max(picture.shape[:2]) > _MOST:
-        got = f"{picture.shape[1]} x {picture.shape[0]}"
-        raise ValueError(f"lens: expected {camera.width} x {camera.height} pixels, each at most {_MOST}, got {got}")
     import cv2  # noqa: PLC0415 - only pictures of lenses need it
 
     x, y = _places(camera, lens)

@@ -178,9 +178,6 @@ def write_mesh(
     that was not measured, is a property of a PLY file's points, and the attribute ``_FILLED`` of a GLB file.
     """
     paths = [paths] if isinstance(paths, Path) else list(paths)
-    for path in paths:  # before anything is written
-        if path.suffix.lower() not in (".ply", ".glb"):
-            raise ValueError(f"{path}: expected a mesh file, .ply or .glb, got {path.suffix or 'no suffix'}")
     mesh = triangulate(depth, camera, tolerance=tolerance)
     if not len(mesh.faces):
         raise ValueError(f"{paths[0]}: expected neighbours of known depth to make a surface of, got none")
