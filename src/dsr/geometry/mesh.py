@@ -347,7 +347,6 @@ def _integrate(
 
 
 def _extract(blocks: NDArray[np.int64], distance: np.ndarray, weight: np.ndarray, voxel: float) -> FusedMesh:
-    """Return the triangles where the distance is 0, one layer of blocks after the other."""
     low = blocks.min(0)
     size = tuple(_SIDE * (blocks.max(0) - low + 1)[:2] + 1)
     vertices, normals, faces, count = [], [], [], 0

@@ -192,7 +192,6 @@ class _Reduced(NamedTuple):
 
 
 def _prepare(each: PosedMap) -> _Reduced:
-    """Return a frame to compare."""
     step = min(-(-each.camera.width // _WIDEST), each.camera.height)
     camera = each.camera.decimate(step, step // 2)
     depth = each.depth[step // 2 :: step, step // 2 :: step][: camera.height, : camera.width]

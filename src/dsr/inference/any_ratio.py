@@ -151,21 +151,13 @@ class AnyRatio(Method):
     ) -> Surface:
         """Upsample a depth map, (1, h, w) in metres with NaN in holes, to the size of a photo, (3, H, W) in [0, 1].
 
-        Both are registered: the same view and field of view, outer edge on outer edge. ``facets`` states the expected
-        errors; for other methods they are estimated, see :mod:`dsr.inference.plausibility`, unless not
-        ``estimate_errors``.
+        Both are registered: the same view and field of view, outer edge on outer edge; the camera is the photo's. The
+        depth is (1, H, W) float32, as its errors on the device of ``depth``. ``facets`` states the expected errors; for
+        other methods they are estimated, see :mod:`dsr.inference.plausibility`, unless not ``estimate_errors``.
 
-        Args:
-            camera: the photo's; only interpolation and deep image priors depend on it.
-            sensor: what measured the map: of :func:`~dsr.inference.find_sensor`, or its argument; None for none. No
-                expected error is less than what remains of the sensor's least noise, and a systematic error of which
-                its maker states a limit is added. If it counts disparity, see also
-                :func:`~dsr.inference.working_size.known_noise`.
-
-        Returns:
-            Depth, (1, H, W) float32 in metres, its expected errors, and which depth is filled in, on the device of
-            ``depth``; and its outliers.
-
+        ``sensor``: what measured the map: of :func:`~dsr.inference.find_sensor`, or its argument; None for none. No
+        expected error is less than what remains of the sensor's least noise, and a systematic error of which its maker
+        states a limit is added. If it counts disparity, see also :func:`~dsr.inference.working_size.known_noise`.
         """
         expect_picture(rgb, depth, camera)
         planned = self.plan(size_of(rgb), size_of(depth))  # raises ValueError for sizes or a scale that cannot be used
@@ -261,7 +253,6 @@ class AnyRatio(Method):
         return at_factors([(step, self._method(step)) for step in planned.steps], rgb, inverse, camera, progress)
 
     def _method(self, factor: int) -> Method:
-        """Return the method for a factor, which is built once."""
         if factor not in self._methods:
             try:
                 self._methods[factor] = self.recipe.build(factor, self._run, **_DECIDED)

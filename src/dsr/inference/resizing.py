@@ -61,13 +61,6 @@ def plan_for(recipe: Recipe, photo_size: Size, depth_size: Size, scale: int | No
     ``scale`` is the factor; None to choose it by the sizes, 4 if they are equal. A ValueError if the method has no
     weights for it, or the sizes do not fit together. This plan does not apply to a depth map of the photo's size that
     was enlarged by repeating pixels: it is upsampled from the low-resolution map that it was before.
-
-    Example:
-        >>> from dsr.inference.resizing import plan_for
-        >>> from dsr.methods.recipe import read_recipe
-        >>> plan_for(read_recipe("facets"), (1440, 1920), (192, 256)).scale  # of a phone's depth
-        8
-
     """
     method, abilities, factors = recipe.name, recipe.abilities, steps_of(recipe)
     ratio = _ratio(photo_size, depth_size)
@@ -98,7 +91,6 @@ def plan_for(recipe: Recipe, photo_size: Size, depth_size: Size, scale: int | No
 
 
 def _ratio(photo_size: Size, depth_size: Size) -> float:
-    """Return how much larger the photo is than the depth map."""
     if min(*photo_size, *depth_size) < 1:
         raise ValueError(f"sizes: expected positive ones, got a photo of {photo_size} and depth of {depth_size}")
     down, across = photo_size[0] / depth_size[0], photo_size[1] / depth_size[1]
@@ -112,7 +104,6 @@ def _ratio(photo_size: Size, depth_size: Size) -> float:
 
 
 def _scale(requested: int | None, ratio: float, method: str, factors: Mapping[int, tuple[int, ...]]) -> int:
-    """Return the requested factor, or the smallest that reaches the photo's size."""
     if not factors:
         if requested is not None and requested < 1:
             raise ValueError(f"scale: expected a positive whole number, got {requested}")

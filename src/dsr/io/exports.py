@@ -95,10 +95,7 @@ class Written(NamedTuple):
 
 
 def normal_strips(depth: Tensor, camera: Camera) -> Iterator[tuple[slice, Tensor]]:
-    """Yield the rows of one strip after another, and its normals, (3, rows, W) float32, NaN where unknown.
-
-    The strips together are what :func:`dsr.geometry.surface.depth_to_normals` gives for the whole map, (1, H, W).
-    """
+    """Yield the rows of one strip after another, and its normals, (3, rows, W) float32, NaN where unknown."""
     height, width = camera.height, camera.width
     rows = max(1, _STRIP // width)
     for start in range(0, height, rows):

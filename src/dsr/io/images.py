@@ -154,7 +154,6 @@ def _read_npy(path: Path) -> np.ndarray:
 
 
 def _read_npz(path: Path) -> np.ndarray:
-    """Return the array named depth, or the only one."""
     names = sorted(array_headers(path))
     if len(names) != 1 and "depth" not in names:
         raise ValueError(f"{path}: expected one array, or one named depth; got {', '.join(names) or 'none'}")

@@ -40,7 +40,6 @@ _DAMAGED = (ValueError, RuntimeError, SyntaxError, EOFError, OSError, IndexError
 
 
 def _turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Return a photo, (H, W, 3), turned as an EXIF orientation says."""
     exchange, rows, columns = _TURNS[orientation]
     return (pixels.transpose(1, 0, 2) if exchange else pixels)[::rows, ::columns]
 
@@ -176,10 +175,7 @@ def write_png(path: Path, picture: np.ndarray, known: np.ndarray | None = None) 
 
 
 def encode_png(picture: np.ndarray) -> bytes:
-    """Return a picture, (H, W) or (H, W, 2, 3 or 4) blue first, uint8 or uint16, as a PNG.
-
-    Two channels are grey and opacity, of 8 bits. Level 6 takes half the space of OpenCV's own level for depth.
-    """
+    """Return a picture, (H, W) or (H, W, 2, 3 or 4) blue first, uint8 or uint16, as a PNG; 2: grey and opacity."""
     if picture.ndim == 3 and picture.shape[2] == 2:  # which OpenCV would write as four
         content = io.BytesIO()
         Image.fromarray(picture).save(content, "PNG", compress_level=_LEVEL)

@@ -36,10 +36,7 @@ def _common(values: Sequence[_Value]) -> _Value | None:
 
 
 def to_millimetres(depth: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return depth in metres as whole millimetres, (H, W) uint16 with 0 in holes, and how many pixels are too far.
-
-    Depth of 65.535 m and more does not fit, and becomes a hole.
-    """
+    """Return depth in metres as millimetres, (H, W) uint16, 0 in holes and beyond 65.535 m, and how many are beyond."""
     values = np.rint(depth.astype(np.float64) * _MILLIMETRES)
     fits = (values > 0) & (values <= _STEPS)
     return np.where(fits, values, 0).astype(np.uint16), int((values > _STEPS).sum())
@@ -105,7 +102,6 @@ def write_open3d(folder: Path, frames: Sequence[Frame]) -> list[Path]:
 
 
 def _write_intrinsics(path: Path, camera: Camera) -> None:
-    """Write Open3D's JSON of a camera."""
     matrix = [camera.fx, 0.0, 0.0, 0.0, camera.fy, 0.0, camera.cx, camera.cy, 1.0]
     entries = {"width": camera.width, "height": camera.height, "intrinsic_matrix": matrix}
     write_text(path, json.dumps(entries, indent=2) + "\n")
@@ -151,7 +147,6 @@ def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
 
 
 def _intrinsics(camera: Camera) -> dict[str, float]:
-    """Return the camera's entries."""
     return {
         "w": camera.width,
         "h": camera.height,

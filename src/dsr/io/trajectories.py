@@ -211,11 +211,7 @@ def describe_capture(app: str, unit: str, pairs: Sequence[Pair], *, poses: bool)
 
 
 def add_trajectory(folder: Path, found: PairingResult) -> PairingResult:
-    """Return the pairs of a folder with the poses of Open3D's trajectory, if it fits.
-
-    It has a line of three whole numbers, the first of which orders the poses, and the four rows of each pose
-    (http://redwood-data.org/indoor/fileformat.html).
-    """
+    """Return the pairs of a folder with the poses of Open3D's trajectory (redwood-data.org/indoor/fileformat.html)."""
     path = next((folder / name for name in _OPEN3D_FILES if (folder / name).is_file()), None)
     if path is None or not found.pairs:
         return found
@@ -242,7 +238,6 @@ def add_trajectory(folder: Path, found: PairingResult) -> PairingResult:
 
 
 def _geometry_of_log(place: str, rows: tuple[str, ...]) -> Geometry:
-    """Return the pose of a frame; its camera is read from the file beside the pictures."""
     values = [numbers_in(row.split()) for row in rows]
     if [len(row) for row in values] != [4] * 4:
         raise ValueError(f"{place}: expected a matrix of 4 x 4 numbers, got {' '.join(rows)!r:.80}")

@@ -25,12 +25,9 @@ _MANY, _LONG = 50, 2.0  # of more items only those get a line that take so many 
 
 
 def open_console() -> Console:
-    """Return a console on stdout, wide enough for tables if that is not a terminal.
-
-    What stdout cannot encode, such as the name of a file that is no text, is shown with escapes.
-    """
+    """Return a console on stdout, wide enough for tables if that is not a terminal."""
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")
+        sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be no text
     console = Console()
     return console if console.is_terminal else Console(width=_LOG_WIDTH)
 
@@ -73,11 +70,7 @@ def one_line(error: BaseException) -> str:
 
 
 class ConsoleProgress(Progress):
-    """Shows progress with named times: bars on a terminal, elsewhere plain lines.
-
-    If the output is not a terminal, each finished item gets a line, and running work gets one every ten seconds.
-    ``now`` returns the time in seconds.
-    """
+    """Shows progress: bars on a terminal, elsewhere lines, of finished items, and of running work every ten seconds."""
 
     def __init__(self, console: Console, now: Callable[[], float] = time.monotonic) -> None:
         self._console, self._now, self._next_line = console, now, 0.0

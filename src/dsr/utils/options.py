@@ -161,10 +161,7 @@ Record = TypeVar("Record", bound=Options)
 
 
 def add_options(place: Any, record: type[Options], *, needed: bool = True) -> None:
-    """Add the options of a record, which are required only if it is ``needed``, to a parser or a group of it.
-
-    An option that isn't given is absent from the namespace.
-    """
+    """Add a record's options, required only if ``needed``, to a parser or a group; the namespace lacks others."""
     excluding: dict[str, Any] = defaultdict(place.add_mutually_exclusive_group)
     for each in _options_of(record):
         if each.group:

@@ -40,11 +40,7 @@ class InUseError(ValueError):
 
 @contextlib.contextmanager
 def at_work(folder: Path, settings: str) -> Iterator[None]:
-    """Within this context a directory, which is made if need be, belongs to commands with the same settings.
-
-    The last command that leaves removes the locks, and the directory if it was made for them and is empty. If a command
-    with other settings is at work there, this is an InUseError.
-    """
+    """Within this context a directory belongs to commands with the same settings; InUseError for others."""
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     place = folder / LOCKS
     beginning = f"command-{_digest(settings)}-"

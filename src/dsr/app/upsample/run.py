@@ -93,7 +93,6 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
 
 
 def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str]:
-    """Upsample frames in a folder of this command's own, and return the problems."""
     wanted, shard, pairs = request.results, request.frames.shard, frames.found.pairs
     started = time.monotonic()
     written = [*(name for part in wanted.of_all for name in part.files), EXPORTS]
@@ -169,7 +168,6 @@ def work_through(request: UpsampleRequest, frames: Frames, tell: Tell, progress:
 
 
 def _begin(request: UpsampleRequest, frames: Frames) -> FrameWork:
-    """Prepare a worker, which reads frames again only for their neighbours."""
     return FrameWork(request, frames, kept=_KEPT if request.frames.neighbours else 0)
 
 
@@ -225,7 +223,6 @@ def _show_found(request: UpsampleRequest, frames: Frames, console: Console) -> N
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Return the first names, and how many more there are."""
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return ", ".join(names[:_SHOWN]) + more
 
@@ -325,7 +322,6 @@ class FrameWork:
         return self._steady
 
     def _folder(self, pair: Pair, target: Path) -> ResultFolder:
-        """Return the folder of a frame's results, with what these depend on."""
         request = self._request
         inputs = inputs_with_neighbours(request, pair, self._sequence.neighbours(pair))
         return ResultFolder(target, inputs, request.settings, request.results, strict=request.reading.strict)

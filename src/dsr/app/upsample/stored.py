@@ -176,10 +176,7 @@ def read_depth(folder: Path, camera: Camera) -> np.ndarray:
 
 
 def read_errors(folder: Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return the expected errors of depth and normal of a result, (H, W) float32 each, in metres and degrees.
-
-    A damaged or foreign file is a ValueError, a missing one an OSError.
-    """
+    """Return the expected errors of depth and normal of a result, (H, W) float32 each, in metres and degrees."""
     path = folder / ERRORS
     size = (camera.height, camera.width)
     shapes = {name: shape for name, (shape, _) in array_headers(path).items()}
@@ -191,10 +188,7 @@ def read_errors(folder: Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_frame(name: str, folder: Path) -> Frame:
-    """Return the frame whose results are in a folder; a ValueError if they are not complete.
-
-    Its pose is the entry ``pose`` of ``info.json``: a camera-to-world matrix of four lists of four numbers, in metres.
-    """
+    """Return the frame whose results are in a folder; a ValueError if they are not complete."""
     info = read_complete(folder)
     depth, colour = folder / METRES, folder / "rgbd" / RGBD[0]
     if not (depth.is_file() and colour.is_file()):

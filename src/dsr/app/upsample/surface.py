@@ -232,7 +232,6 @@ class Surface(Generic[Array]):
         return f"Surface({size}, {self._range()}, {self._plan.method} x{self._plan.scale})"
 
     def _range(self) -> str:
-        """Return the nearest and the farthest depth."""
         known = self._found.depth[self._found.depth.isfinite()]
         return f"{known.min():.3g} to {known.max():.3g} m" if len(known) else "nothing known"
 
@@ -271,7 +270,6 @@ class Surface(Generic[Array]):
         return depth
 
     def _colours(self, mesh: Mesh) -> np.ndarray:
-        """Return the photo's colours at the vertices, (N, 3) uint8."""
         return as_bytes(self._picture.rgb.flatten(1)[:, torch.from_numpy(mesh.pixels)]).T
 
     def _give(self, values: Tensor | None) -> Array:

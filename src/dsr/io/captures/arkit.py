@@ -77,7 +77,6 @@ def find_arkitscenes(folder: Path) -> PairingResult | None:
 
 
 def _time(stem: str) -> float:
-    """Return the time in a frame's name, NaN if there is none."""
     return next(iter(numbers_in([stem.rpartition("_")[2]])), math.nan)
 
 

@@ -149,7 +149,6 @@ def _track(path: Path, container: Any, role: str) -> Any:
 
 
 def _geometry(place: str, content: bytes, size: Size, size_lr: Size) -> Geometry:
-    """Return the cameras of a recording with photos and depth maps of (height, width)."""
     calibration = parse_model(_Calibration, content.rstrip(b"\0"), place, f"expected the calibration of {_APP}; ")
     cameras = {each.location: each for each in calibration.cameras}
     for location in (_COLOUR_CAMERA, _DEPTH_CAMERA):

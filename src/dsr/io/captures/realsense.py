@@ -154,7 +154,6 @@ def _entries(message: Any, expected: str) -> dict[str, str]:
 
 
 def _geometry(color: _Stream, depth: _Stream) -> tuple[Geometry, list[Assumption]]:
-    """Return the cameras of a recording, and how depth and photo belong together."""
     notes = (*color.notes, *depth.notes)
     geometry = Geometry(color.camera, None, notes, color.lens)
     if color.transform is None or depth.transform is None or color.reference != depth.reference:
@@ -168,7 +167,6 @@ def _geometry(color: _Stream, depth: _Stream) -> tuple[Geometry, list[Assumption
 
 
 def _unit(reader: Any, path: Path, sensor: str) -> tuple[float, list[Assumption]]:
-    """Return metres per value of the depth stream, and an assumption if it is not stated."""
     message = first_message(reader, f"{sensor}/option/Depth_Units/value")
     if message is not None:
         unit = numbers_in([str(message.data)])

@@ -83,7 +83,6 @@ def frames_of_video(
 
 
 def _read_odometry(path: Path) -> dict[int, _Row]:
-    """Return the rows of the odometry by frame, with their values as text; empty without the file."""
     if not path.is_file():
         return {}
     with refusing(f"{path}: expected a table of {_APP}, got a damaged or foreign file", csv.Error):
@@ -168,7 +167,6 @@ class _Player:
         return cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
 
     def _open(self) -> None:
-        """Open the video at its first frame."""
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read once; its threads may print messages later
         before = os.environ.get(_OPTIONS)
         os.environ[_OPTIONS] = "ignore_editlist;1"  # decodes the frames that it hides: Stray Scanner's first one
