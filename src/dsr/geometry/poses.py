@@ -220,10 +220,7 @@ def _compare(frame: _Reduced, other: _Reduced) -> tuple[np.ndarray, np.ndarray]:
 
 
 def check_poses(count: int, load: Callable[[int], PosedMap | None]) -> Assumption | None:
-    """Return a warning where frames disagree under the poses as given; None if they show too little.
-
-    Some frames of a sequence are compared; ``load`` returns one, or None if it has no pose.
-    """
+    """Return a warning if frames, which ``load`` returns, disagree under their poses; None if they show too little."""
     pairs: list[tuple[_Reduced, _Reduced]] = []
     for group in sample(count):
         pairs += itertools.combinations([_prepare(each) for each in map(load, group) if each is not None], 2)

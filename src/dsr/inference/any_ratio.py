@@ -206,10 +206,7 @@ class AnyRatio(Method):
         self, rgb: Tensor, measured: Tensor, inverse: Tensor, camera: Camera, sensor: Identified | None,
         progress: Steps | None,
     ) -> InverseSurface:  # fmt: skip
-        """Return high-resolution inverse depth of inverse depth, (1, h, w), whose size may be divided first.
-
-        The noise is that of the ``measured`` one, some of whose holes are filled in the other.
-        """
+        """Return high-resolution inverse depth, at a size that the noise of the ``measured`` one suggests."""
         noise, factor = self._choose_size(measured, camera)
         known = None if "noise" in self.recipe.settings else known_noise(sensor, noise, factor)
         if factor == 1:
@@ -269,10 +266,7 @@ class AnyRatio(Method):
 
 
 def finds_noise(recipe: Recipe) -> bool:
-    """Return whether a method may work at a size that the map's noise suggests.
-
-    It has to have weights for several ratios of the sizes, and no setting that there is no noise.
-    """
+    """Return whether a method has weights for several ratios, of which the noise of a map may suggest one."""
     return bool(recipe.computed_at) and not is_told_clean(recipe)
 
 

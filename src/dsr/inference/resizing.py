@@ -137,10 +137,7 @@ def at_ratio(
 def at_factors(
     stages: Sequence[tuple[int, Method]], rgb: Tensor, inverse: Tensor, camera: Camera, progress: Steps | None
 ) -> InverseSurface:
-    """Run methods in turn, each at its factor and on the result of the one before, and resize the last one's result.
-
-    The photo is (3, H, W), and the camera is its; the map is (1, h, w).
-    """
+    """Run methods in turn, each at its factor on the result before; the last result gets the photo's size."""
     size = size_of(rgb)
     sizes = [size_of(inverse)]  # of the low-resolution map of each stage
     sizes += [(-(-size[0] // factor), -(-size[1] // factor)) for factor, _ in stages[1:]]

@@ -65,10 +65,7 @@ def write_ply(
     filled: np.ndarray | None = None,
     frame: str = CAMERA_FRAME,
 ) -> None:
-    """Write a binary PLY file of points (N, 3), their colours (N, 3) uint8 and normals (N, 3), and faces (M, 3).
-
-    ``filled``, (N,) bool, whether points were not measured, is a property of that name; ``frame`` is a comment.
-    """
+    """Write a binary PLY file of points (N, 3), colours (N, 3) uint8, normals, faces (M, 3) and flags ``filled``."""
     import trimesh  # noqa: PLC0415 - half a second that most results save
     from trimesh.exchange.ply import export_ply  # noqa: PLC0415
 
@@ -296,10 +293,7 @@ def write_stereo(path: Path, rgb: Tensor, depth: Tensor, camera: Camera) -> list
 
 
 def write_rgbd_picture(path: Path, rgb: Tensor, depth: Tensor, _camera: Camera) -> list[Assumption]:
-    """Write a PNG of the photo and, at its right, its inverse depth as grey from far, black, to near, white.
-
-    Holes of the depth, (1, H, W) in metres, continue what is behind them.
-    """
+    """Write a PNG of the photo and, at its right, inverse depth as grey; holes continue what is behind them."""
     inverse, _ = _filled(depth[0].double().reciprocal().nan_to_num(-1.0).numpy())
     far, near = np.quantile(inverse, (1 - _NEARLY_ALL, _NEARLY_ALL))
     grey = as_bytes(torch.from_numpy((inverse - far) / max(near - far, np.finfo(float).tiny)))

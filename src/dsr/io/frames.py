@@ -72,14 +72,10 @@ class Rig(NamedTuple):
 
 
 class Geometry(NamedTuple):
-    """Cameras, lenses and poses of a frame as its capture states them; None where it does not.
-
-    ``pose``: camera to world, (4, 4) float64 in metres, rigid, of the camera's frame x right, y down, z forward; the
-    world's frame is the capture's own.
-    """
+    """Cameras, lenses and poses of a frame as its capture states them; None where it does not."""
 
     camera: Camera | None = None  # of a size of its own, which is scaled to the photo's
-    pose: np.ndarray | None = None
+    pose: np.ndarray | None = None  # camera (x right, y down, z forward) to the capture's world, (4, 4), rigid, metres
     assumptions: tuple[Assumption, ...] = ()
     lens: Lens | None = None  # of the photo, and of a depth map without a rig, which lies in the photo's pixels
     rig: Rig | None = None  # the depth map's camera, of a size of its own as well; None if it is in the photo's view

@@ -45,10 +45,7 @@ def to_millimetres(depth: np.ndarray) -> tuple[np.ndarray, int]:
 def _write_pictures(
     folder: Path, kinds: tuple[str, str], frame: Frame, values: np.ndarray, known: np.ndarray | None = None
 ) -> list[Path]:
-    """Write the photo and values of the depth, (H, W) uint16, of a frame into two folders, and return the files.
-
-    ``known``, (H, W) bool, the pixels with depth, makes a mask in ``masks/``, too, 255 there and 0 in holes.
-    """
+    """Write a frame's photo, values of its depth, (H, W) uint16, and a mask if some are ``known``; return the files."""
     photo, depth, mask = (folder / kind / f"{frame.stem}.png" for kind in (*kinds, "masks"))
     with replacing(photo) as temporary:
         shutil.copyfile(frame.colour, temporary)
@@ -65,10 +62,7 @@ def _have_holes(frames: Sequence[Frame]) -> bool:
 
 
 def write_rgbd(folder: Path, rgb: Tensor, depth: Tensor, camera: Camera) -> list[Assumption]:
-    """Write ``color.png``, ``depth.png`` and ``intrinsic.json`` of one frame; note pixels that are too far for 16 bits.
-
-    ``rgb``: (3, H, W) in [0, 1]. ``depth``: (1, H, W) in metres, NaN in holes.
-    """
+    """Write ``color.png``, ``depth.png`` and ``intrinsic.json``; note pixels that are too far for 16 bits."""
     millimetres, lost = to_millimetres(depth[0].cpu().numpy())
     write_png(folder / RGBD[0], np.ascontiguousarray(as_bytes(rgb).transpose(1, 2, 0)[..., ::-1]))
     write_png(folder / RGBD[1], millimetres)

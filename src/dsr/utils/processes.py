@@ -147,10 +147,7 @@ class Pool:
     def results(
         self, function: Callable[..., _Value], items: Sequence[_Item], *, ordered: bool = False
     ) -> Generator[tuple[_Item, _Value]]:
-        """Begin to work on items, and return each with its value, as they come or in their order.
-
-        What a killed worker has left is begun again. If workers are killed twice, a ChildProcessError is raised.
-        """
+        """Begin to work on items; yield each with its value as they come, or ``ordered``. ChildProcessError ends it."""
         left, executor = self._submit(function, items)
 
         def values() -> Generator[tuple[_Item, _Value]]:

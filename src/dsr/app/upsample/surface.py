@@ -121,12 +121,7 @@ class Surface(Generic[Array]):
         return self._picture.camera
 
     def normals(self) -> Array:
-        """Return the unit normals, which face the camera, float32, NaN in holes.
-
-        Returns:
-            (H, W, 3) as an array, (3, H, W) as a tensor.
-
-        """
+        """Return the unit normals, which face the camera, NaN in holes: (H, W, 3) float32, or a tensor (3, H, W)."""
         normals = self._normals
         return cast("Array", normals.numpy().transpose(1, 2, 0) if self._device is None else normals.to(self._device))
 

@@ -26,7 +26,7 @@ from dsr.io.captures.archive import as_pixels, decode_photo
 from dsr.io.frames import CaptureFrame, Geometry, Part, Record, Rig, Size, file_state, stated
 from dsr.io.pairs import PairingResult, Shot, pair_by_time
 from dsr.io.trajectories import describe_capture, intrinsics_camera
-from dsr.utils.guards import expect_pixels, expect_size, numbers_in, opened, refusing
+from dsr.utils.guards import expect_pixels, expect_size, numbers_in, refusing
 from dsr.utils.validation import Number, Whole, parse_model
 from dsr.utils.versions import how_to_install
 
@@ -206,6 +206,4 @@ def _open(path: Path, _state: tuple[int, int]) -> Any:
     """Return the open recording; FFmpeg only takes it apart, and decodes nothing."""
     import av  # noqa: PLC0415 - an extra
 
-    with opened(path) as file:
-        file.read(1)  # or the error names the file, such as that of a link to a device
     return av.open(str(path), format="matroska", options={"codec_whitelist": "rawvideo", "analyzeduration": "0"})
