@@ -21,8 +21,6 @@ from dsr.io.photos import encode_png, to_jpeg, write_png
 from dsr.io.posed_frames import Frame, colmap_model, initial_gaussians, sample_points
 from dsr.notes import Assumption
 from dsr.utils.files import replacing, write_text
-from dsr.utils.guards import refusing
-from dsr.utils.versions import how_to_install
 
 _Value = TypeVar("_Value")
 NORMALS = "normals_from_pretrain"  # a folder that dn-splatter looks for
@@ -192,8 +190,7 @@ def write_rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:
     They are on the timeline ``frame``, by number, and on ``time`` if all frames have one. Cameras have the axes RDF;
     the world's are known as far as it is known which one points up. The library is the extra ``rerun``.
     """
-    with refusing(f"rerun: expected the library rerun-sdk; {how_to_install('rerun')}", ImportError):
-        rerun = importlib.import_module("rerun")
+    rerun = importlib.import_module("rerun")
     recording = rerun.RecordingStream("dsr")
     with replacing(path) as temporary:
         recording.save(str(temporary))

@@ -177,8 +177,6 @@ def _matrix_of_json(path: Path, text: str) -> list[list[float]]:
 
 def check_pose(source: str, matrix: np.ndarray, *, opengl: bool = False) -> np.ndarray:
     """Return a rigid transform (4, 4) from camera to world; ``opengl``: the camera's axes are x right, y up."""
-    if matrix.shape != (4, 4):
-        raise ValueError(f"{source}: expected a matrix of 4 x 4 numbers, got {' x '.join(map(str, matrix.shape))}")
     as_rigid(matrix, source)
     return matrix @ ARKIT_TO_DSR if opengl else matrix
 

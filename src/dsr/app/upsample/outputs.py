@@ -209,10 +209,7 @@ class ResultFolder:
                 "noise": surface.noise._asdict() if surface.noise else kept.get("noise"),
                 **_described(picture, result.encoding),
                 **counts,
-                "shares": {
-                    **kept.get("shares", {}),
-                    **{name: round(share, 6) for name, share in result.shares.items()},
-                },
+                "shares": kept.get("shares", {}) | {name: round(share, 6) for name, share in result.shares.items()},
                 "assumptions": [*map(str, notes), *said],
                 "checks": CHECKS,
                 "warnings": [note.record() for note in notes if note.code],

@@ -42,11 +42,11 @@ class Capture:
         if place.is_file():
             if of_file is None or place.suffix.lower() not in self.suffixes:
                 return None
-            if not self.mark(place):
-                if self.fallback:
-                    return None
-                raise ValueError(f"{place}: expected {self.name}, got another {place.suffix} file")
-            return of_file(place)
+            if self.mark(place):
+                return of_file(place)
+            if self.fallback:
+                return None
+            raise ValueError(f"{place}: expected {self.name}, got another {place.suffix} file")
         found = self.of_folder(place)
         if found is not None or of_file is None:
             return found
