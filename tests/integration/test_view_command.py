@@ -114,7 +114,7 @@ def large():
         (lambda folder: write_result(folder, camera=large()), "expected float32 of shape (128, 128)"),
         (spoil_camera, "r/info.json: expected the photo's camera under `camera`"),
         (lambda folder: (folder / "depth_metres.tiff").unlink(), "r: expected a result with depth"),
-        (lambda folder: cut(folder / "depth_metres.tiff"), "depth_metres.tiff: expected a map of depths, got"),
+        (lambda folder: cut(folder / "depth_metres.tiff"), "depth_metres.tiff: expected a picture as PNG"),
         (all_holes, "expected depths, all"),
         (lambda folder: cut(folder / "confidence.npz"), "r/confidence.npz: expected an archive of arrays"),
         (lambda folder: cut(folder / "input.npz"), "r/input.npz: expected an archive of arrays, got a damaged"),

@@ -32,7 +32,7 @@ from dsr.notes import Assumption, expect_no_warning
 from dsr.report.surface_page import Packed, is_view, pack_result, save_view
 from dsr.utils.console import ConsoleProgress, one_line, show
 from dsr.utils.files import expect_target
-from dsr.utils.guards import natural_key, refusing_excess
+from dsr.utils.guards import naming, natural_key, refusing_excess
 from dsr.utils.progress import megabytes, show_length
 
 _WHOLE_PAGE = 6  # the page has at most this many times the vertices of one surface
@@ -116,11 +116,9 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
     def maps() -> Iterator[PosedMap]:
         return (_load(folder, max_error) for folder in frames)
 
-    try:
+    with naming(f"{frames[0]}{' and others' if len(frames) > 1 else ''}"):
         voxel = suggest_voxel(maps()) if request.voxel is None else request.voxel
         mesh = fuse_maps(maps, voxel)
-    except ValueError as error:
-        raise ValueError(f"{frames[0]}{' and others' if len(frames) > 1 else ''}: {error}") from error
     colours = _colours(mesh.vertices, frames, max_error, _SEEN * voxel, problems)
     ups = {read_complete(folder)["up"] for folder in frames}
     frame = _write(request.output, mesh, colours, ups.pop() if len(ups) == 1 else "")

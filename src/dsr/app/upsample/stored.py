@@ -32,7 +32,7 @@ from dsr.notes import Assumption, read_warning
 from dsr.sample import expect_distances
 from dsr.utils.arrays import array_headers
 from dsr.utils.files import write_text
-from dsr.utils.guards import TooLargeError, is_number, natural_key, parse_json, path_within, pixels_beside, read_limited
+from dsr.utils.guards import is_number, natural_key, parse_json, path_within, pixels_beside, read_limited, refusing
 from dsr.utils.progress import show_length
 
 if TYPE_CHECKING:
@@ -49,6 +49,7 @@ _OPTIONAL: Mapping[str, Any] = {  # entries that ``info.json`` may lack, as whil
     "photo_size": [],
     "input_size": [],
 }
+_FOREIGN = "{}: expected a file of `dsr upsample`, got something else"
 _DEEPEST = 6  # folders below the given one in which results are looked for
 
 
@@ -112,7 +113,7 @@ def read_info(folder: Path) -> dict[str, Any] | None:
     path = folder / INFO
     if not path.is_file():
         return None
-    try:
+    with refusing(_FOREIGN.format(path), ValueError, KeyError, TypeError, AttributeError):
         info = {**_OPTIONAL, **parse_json(read_limited(path), finite=False)}
         lists = [info[name] for name in ("files", "assumptions", "warnings", "photo_size", "input_size")]
         records = [info[name] for name in ("inputs", "settings", "shares", "seconds")]
@@ -126,8 +127,6 @@ def read_info(folder: Path) -> dict[str, Any] | None:
         warnings_of(info)
         up = info.get("up")
         return {**info, "complete": info["complete"] is True, "up": up if up in UPS else ""}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else") from error
 
 
 def warnings_of(info: Mapping[str, Any]) -> tuple[Assumption, ...]:
@@ -159,12 +158,7 @@ def read_depth(folder: Path, camera: Camera) -> np.ndarray:
     path, size = folder / METRES, (camera.height, camera.width)
     if not path.is_file():
         raise ValueError(f"{folder}: expected a result with depth, got one without {METRES}; run it with --only depth")
-    try:
-        stored = read_depth_file(path, pixels_beside(*size))
-    except TooLargeError:
-        raise
-    except (ValueError, OSError) as error:
-        raise ValueError(f"{path}: expected a map of depths, got a damaged or foreign file") from error
+    stored = read_depth_file(path, pixels_beside(*size))
     if stored.shape != size or stored.dtype != np.float32:
         text = f"{stored.dtype} of shape {stored.shape}"
         raise ValueError(f"{path}: expected float32 of shape {size}, the photo's, got {text}")
@@ -265,13 +259,11 @@ def read_exports(output: Path) -> dict[str, list[str]]:
     path = output / EXPORTS
     if not path.is_file():
         return {}
-    try:
+    with refusing(_FOREIGN.format(path), ValueError, KeyError, TypeError):
         exports = dict(parse_json(read_limited(path))["exports"])
         lists = [files if isinstance(files, list) else [None] for files in exports.values()]
         if not all(isinstance(file, str) for files in lists for file in files):
             raise TypeError
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else") from error
     for name, files in exports.items():
         for file in files:
             path_within(output, file, f"{path}: exports.{name}")
