@@ -181,14 +181,9 @@ class ResultFolder:
         with ThreadPoolExecutor(1) as beside:  # shapes take as long as all the rest
             shapes = beside.submit(_write_shapes, self.path, result)
             written = _write_maps(self.path, result) | shapes.result()
-        files: dict[str, None] = {}  # each once, as the notes
-        facts: dict[Assumption, None] = {}
-        counts: dict[str, dict[str, Any]] = {}
-        for name, output in written.items():
-            files |= dict.fromkeys(output.files)
-            facts |= dict.fromkeys(output.notes)
-            if output.shape is not None:
-                counts[name] = output.shape._asdict()
+        files = dict.fromkeys(name for output in written.values() for name in output.files)  # each once
+        facts = dict.fromkeys(note for output in written.values() for note in output.notes)
+        counts = {name: output.shape._asdict() for name, output in written.items() if output.shape is not None}
         others = [name for name in kept.get("files", ()) if name not in files]
         notes = (*picture.assumptions, *facts)
         known = ("warning: ", *(note.text for note in notes))
