@@ -243,7 +243,7 @@ def walls(make, tmp_path):
         pose[0, 3] = 0.2 * number
         frames.append(replace(make(number, pose), errors=tmp_path / f"{number}.npz"))
         write_depth_file(frames[-1].depth, depth[number])
-        np.savez(frames[-1].errors, depth_error=error[number])
+        np.savez(frames[-1].errors, depth_error=error[number], angle_error=error[number])
     return frames
 
 
@@ -275,7 +275,8 @@ def test_colmap_model_is_read_by_colmap(walls, tmp_path):
 def test_initial_gaussians_are_discs_on_the_surface(make, tmp_path):
     frame, depth = make(0), (2 / (1 + CAMERA.rays()[0].numpy())).astype(np.float32)  # the plane x + z = 2
     write_depth_file(frame.depth, depth)
-    np.savez(tmp_path / "e.npz", depth_error=np.where(np.arange(12) < 6, 0.25, 5e-4) * np.ones((8, 1)))
+    errors = np.where(np.arange(12) < 6, 0.25, 5e-4) * np.ones((8, 1))
+    np.savez(tmp_path / "e.npz", depth_error=errors, angle_error=errors)
     write_splatting(tmp_path, [replace(frame, errors=tmp_path / "e.npz", max_error=1.0)])
     raw = trimesh.load(tmp_path / "gaussians.ply").metadata["_ply_raw"]["vertex"]
     several = {"f_dc": 3, "f_rest": 45, "opacity": 0, "scale": 3, "rot": 4}

@@ -20,13 +20,13 @@ from dsr.app.upsample.stored import (
     read_camera,
     read_complete,
     read_depth,
-    read_errors,
     read_result,
 )
 from dsr.geometry.mesh import FusedMesh, fuse_maps, suggest_voxel
 from dsr.geometry.poses import PosedMap, as_rigid, check_poses, visible
 from dsr.io.exports import INPUT, read_input, world_comment, write_glb, write_ply
 from dsr.io.images import read_pixels
+from dsr.io.posed_frames import read_errors
 from dsr.io.scene_files import RGBD
 from dsr.notes import Assumption, expect_no_warning
 from dsr.report.surface_page import Packed, is_view, pack_result, save_view
@@ -171,7 +171,7 @@ def _load(folder: Path, max_error: float) -> PosedMap:
     depth = read_depth(folder, camera).astype(np.float64)
     deviation = None
     if (folder / ERRORS).is_file():
-        deviation = np.maximum(read_errors(folder, camera)[0].astype(np.float64), _LEAST_ERROR)
+        deviation = np.maximum(read_errors(folder / ERRORS, camera)[0].astype(np.float64), _LEAST_ERROR)
         with np.errstate(invalid="ignore"):
             depth = np.where(deviation <= max_error * depth, depth, np.nan)
     return PosedMap(depth, camera, as_rigid(info["pose"], f"{path}: pose"), deviation)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from dsr.app.upsample.parts import ERRORS, FILES, METRES, PARTS, Results
-from dsr.app.upsample.stored import INFO, read_depth, read_errors, read_info
+from dsr.app.upsample.stored import INFO, read_depth, read_info
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import ERROR_SHARE, FLATNESS
 from dsr.inference.resizing import Plan
@@ -34,6 +34,7 @@ from dsr.io.exports import (
 )
 from dsr.io.inputs import Picture
 from dsr.io.photos import write_png
+from dsr.io.posed_frames import read_errors
 from dsr.io.scene_files import write_rgbd
 from dsr.methods.base import Surface
 from dsr.notes import CHECKS, Assumption
@@ -159,7 +160,8 @@ class ResultFolder:
         try:
             surface = Surface(torch.from_numpy(read_depth(self.path, camera))[None])
             if errors or (self.path / ERRORS).is_file():
-                depth_error, angle_error = (torch.from_numpy(each)[None] for each in read_errors(self.path, camera))
+                stored = read_errors(self.path / ERRORS, camera)
+                depth_error, angle_error = (torch.from_numpy(each)[None] for each in stored)
                 surface = surface._replace(depth_error=depth_error, angle_error=angle_error)
         except (OSError, ValueError):
             return None

@@ -13,16 +13,15 @@ import numpy as np
 import torch
 
 from dsr.app.upsample.parts import ERRORS, METRES, Part, Results
-from dsr.evaluation.results import load_errors
 from dsr.geometry.camera import Camera
 from dsr.geometry.poses import as_rigid
 from dsr.inference.plausibility import find_filled
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import INPUT, read_input
 from dsr.io.frames import UPS
+from dsr.io.posed_frames import Frame, read_errors
 from dsr.io.scene_files import (
     RGBD,
-    Frame,
     write_open3d,
     write_rerun,
     write_splatting,
@@ -30,7 +29,6 @@ from dsr.io.scene_files import (
 )
 from dsr.notes import Assumption, read_warning
 from dsr.sample import expect_distances
-from dsr.utils.arrays import array_headers
 from dsr.utils.files import write_text
 from dsr.utils.guards import is_number, natural_key, parse_json, path_within, pixels_beside, read_limited, refusing
 from dsr.utils.progress import show_length
@@ -77,7 +75,7 @@ def read_result(folder: Path, name: str) -> ViewedResult:
     depth, notes = read_depth(folder, camera), list(info["assumptions"])
     depth_error = angle_error = None
     if (folder / ERRORS).is_file():
-        depth_error, angle_error = read_errors(folder, camera)
+        depth_error, angle_error = read_errors(folder / ERRORS, camera)
     photo = depth_lr = filled = None
     try:
         photo, depth_lr = read_input(folder / INPUT)
@@ -167,18 +165,6 @@ def read_depth(folder: Path, camera: Camera) -> np.ndarray:
         raise ValueError(f"{path}: expected depths, all pixels are holes")
     expect_distances(str(path), torch.from_numpy(depth))
     return depth
-
-
-def read_errors(folder: Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return the expected errors of depth and normal of a result, (H, W) float32 each, in metres and degrees."""
-    path = folder / ERRORS
-    size = (camera.height, camera.width)
-    shapes = {name: shape for name, (shape, _) in array_headers(path).items()}
-    fits = all(shapes.get(name) == size for name in ("depth_error", "angle_error"))
-    errors = load_errors(path) if fits else None
-    if errors is None:
-        raise ValueError(f"{path}: expected depth_error and angle_error of shape {size}, the photo's, got {shapes}")
-    return errors[0][0].numpy(), errors[1][0].numpy()
 
 
 def read_frame(name: str, folder: Path) -> Frame:
