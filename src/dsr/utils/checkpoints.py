@@ -163,7 +163,6 @@ class Interruption(Checkpoint):
     on_exception = teardown  # after which Lightning does not call ``teardown``
 
     def _act(self, trainer: lightning.Trainer, *, due: bool) -> None:
-        """Save if it is time or if any process was asked to end, and in that case end."""
         agree = trainer.strategy.reduce_boolean_decision
         ends = agree(bool(self.signals), all=False)
         if (ends or agree(due, all=False)) and not trainer.fast_dev_run:  # type: ignore[attr-defined]

@@ -135,7 +135,6 @@ def _options_of(record: type) -> Iterator[_Option]:
 
 
 def _with_those_of_groups(record: type) -> list[_Option]:
-    """Return the options of a record, then those of its groups, without the groups."""
     own = list(_options_of(record))
     inner = [_with_those_of_groups(each.kind) for each in own if each.group]
     return sum(inner, [each for each in own if not each.group])
@@ -146,7 +145,6 @@ class Options:
     """A record of options, which checks its values; dataclasses of options derive from it."""
 
     def __post_init__(self) -> None:
-        """Raise OptionError for a value that is not as expected."""
         for each in _options_of(type(self)):
             value = getattr(self, each.name)
             if value is None or each.group:

@@ -127,7 +127,6 @@ class Pool:
         self._executors: list[ProcessPoolExecutor] = []
 
     def __enter__(self) -> Self:
-        """Return itself."""
         self._others = set(multiprocessing.active_children())
         self._executors.append(self._new_executor())
         return self

@@ -223,7 +223,6 @@ class ResultFolder:
 
 
 def _described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
-    """Return the sizes, the camera with its pose, and the files' encodings for ``info.json``."""
     encodings = {"input_depth": picture.encoding, "depth_file": encoding, "depth_metres": IN_METRES}
     plain = {name: asdict(each) for name, each in encodings.items()}
     for entries in plain.values():
@@ -349,6 +348,5 @@ def _write_shapes(folder: Path, result: Result) -> dict[str, Output]:
 
 
 def _fewer(part: str, what: str, option: str, shape: Written) -> list[Assumption]:
-    """Return a note on a shape that a limit has made smaller."""
     text = f"the {part} has fewer {what} than the depth map gives ({option})"
     return [Assumption(text, str(shape))] if shape.how not in ("", FLAT) else []

@@ -121,7 +121,6 @@ class Results(Options):
     dry_run: bool = option(False, "say what would be done and assumed", recorded=False)
 
     def __post_init__(self) -> None:
-        """Check the values, and that there is something to write."""
         super().__post_init__()
         if not self.names:
             raise ValueError("--only, --without: expected something to be left to write, got nothing")

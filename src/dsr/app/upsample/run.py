@@ -202,7 +202,6 @@ def _check_poses(request: UpsampleRequest, frames: Frames, console: Console) -> 
 
 
 def _show_found(request: UpsampleRequest, frames: Frames, console: Console) -> None:
-    """Show what was found, which files have no partner, and which frames a shard works on."""
     found, total, shard = frames.found, len(frames.whole), request.frames.shard
     named = total == 1 and len(found.pairs) == 1
     lines = [f"{found.pairs[0].rgb} and {found.pairs[0].depth}" if named else f"{total} pairs of photo and depth map"]
@@ -345,7 +344,6 @@ class FrameWork:
 
 
 def _describe(surface: Surface, how: Upsampling) -> list[Assumption]:
-    """Return notes on an estimated noise of the input, on outliers, on what looks like glass, and on wide holes."""
     notes, noise = [], surface.noise
     if noise is not None and "noise" not in how.arguments:
         text = f"about {show_length(noise.deviation, 2)}"
@@ -368,7 +366,6 @@ def _describe(surface: Surface, how: Upsampling) -> list[Assumption]:
 
 
 def _in_brief(noise: MapNoise | None, shares: Mapping[str, float]) -> list[str]:
-    """Return the noise of the input, the size that it was worked on at, and the shares of the pixels that are not 0."""
     brief = []
     if noise is not None:
         brief.append(f"noise {show_length(noise.deviation, 2)}")

@@ -78,8 +78,6 @@ _BY_NAME = {model.name: model for model in _MODELS.values()}
 
 
 class _Camera(NamedTuple):
-    """A camera as it is stored."""
-
     model: _Model
     width: int
     height: int

@@ -63,17 +63,13 @@ class _Camera(BaseModel):
 
 
 class _Calibration(BaseModel):
-    """The attachment."""
-
     cameras: list[_Camera] = Field(validation_alias=AliasPath("CalibrationInformation", "Cameras"))
 
 
 @dataclass(frozen=True)
 class _Packet(Part):
-    """A frame of a recording, by its track and when it was taken in the track's unit."""
-
     track: int
-    time: int
+    time: int  # in the track's unit
 
     def record(self) -> Record:
         """Return the recording's name, the track's and the time, and a hash of the frame."""

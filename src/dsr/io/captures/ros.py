@@ -193,8 +193,6 @@ def _transform(reader: Any, photo: _Topic, depth: _Topic) -> Matrix | None:
 
 
 class _Info(NamedTuple):
-    """What is read of a CameraInfo."""
-
     height: int
     width: int
     numbers: tuple[float, ...]  # fx, fy, cx, cy of (height, width) pixels
