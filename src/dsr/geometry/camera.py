@@ -123,10 +123,8 @@ class Camera:
         """Return the camera of the ``height x width`` window whose first pixel is (``top``, ``left``)."""
         inside = 0 <= top <= top + height <= self.height and 0 <= left <= left + width <= self.width
         if not inside or height < 1 or width < 1:
-            raise ValueError(
-                f"crop: expected a window within {self.height} x {self.width}, "
-                f"got {height} x {width} at row {top}, column {left}"
-            )
+            got = f"{height} x {width} at row {top}, column {left}"
+            raise ValueError(f"crop: expected a window within {self.height} x {self.width}, got {got}")
         return derived(self, width=int(width), height=int(height), cx=float(self.cx - left), cy=float(self.cy - top))
 
     def rescale(self, width: int, height: int) -> Camera:

@@ -113,9 +113,7 @@ class AnyRatio(Method):
         """Check that a working size other than the map's own has an effect with this method and scale."""
         size = self._working_size
         if size not in (None, 1) and not self._may_reduce:
-            raise ValueError(
-                f"working_size: expected facets without a scale, for maps that may have noise, to take {size}"
-            )
+            raise ValueError(f"working_size: expected facets without a scale, for maps that may have noise, got {size}")
 
     def plan(self, size: tuple[int, int], size_lr: tuple[int, int]) -> Plan:
         """Return the plan for a photo and a depth map of these heights and widths."""

@@ -112,9 +112,8 @@ def _scale(requested: int | None, ratio: float, method: str, factors: Mapping[in
         raise ValueError(f"scale: expected one of {', '.join(map(str, sorted(factors)))} for {method}, got {requested}")
     enough = [scale for scale in sorted(factors) if ratio <= SLACK * scale]
     if requested is None and not enough:
-        raise ValueError(
-            f"depth: expected at least 1/{max(factors)} of the photo's size for {method}, got 1/{ratio:.3g}"
-        )
+        least = f"1/{max(factors)} of the photo's size for {method}"
+        raise ValueError(f"depth: expected at least {least}, got 1/{ratio:.3g}")
     return requested or enough[0]
 
 

@@ -219,9 +219,8 @@ def add_trajectory(folder: Path, found: PairingResult) -> PairingResult:
             raise ValueError
         order = order_of([int(line.split()[0]) for line in lines[::5]])
     except ValueError:
-        raise ValueError(
-            f"{path}: expected a line of three whole numbers and four of a matrix for each pose, got {len(lines)} lines"
-        ) from None
+        expected = "a line of three whole numbers and four of a matrix for each pose"
+        raise ValueError(f"{path}: expected {expected}, got {len(lines)} lines") from None
     if found.unpaired or len(order) != len(found.pairs):
         text = f"no poses: {path.name} has {len(order)}, for {len(found.pairs)} pairs"
         text += f" and {len(found.unpaired)} pictures without a partner" if found.unpaired else ""
