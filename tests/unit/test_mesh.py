@@ -353,9 +353,6 @@ def test_maps_are_weighted_by_their_expected_errors():
     assert middle["both"] == pytest.approx((middle["near"] + middle["far"]) / 2, abs=0.002)
 
 
-@pytest.mark.parametrize(
-    ("voxel", "message"), [(0.0, "positive"), (1e-4, "at least about"), (float("nan"), "positive")]
-)
-def test_impossible_voxels_are_refused(voxel, message):
-    with pytest.raises(ValueError, match=f"voxel: .*{message}"):
-        fuse_maps(lambda: [seen(0)], voxel)
+def test_voxels_that_are_too_small_are_refused():
+    with pytest.raises(ValueError, match=r"voxel: .*at least about"):
+        fuse_maps(lambda: [seen(0)], 1e-4)

@@ -3,13 +3,14 @@
 import itertools
 import math
 import webbrowser
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 from rich.console import Console
+from torch import Tensor
 
 from dsr.app.requests import FuseRequest, ViewRequest
 from dsr.app.upsample.parts import ERRORS
@@ -19,19 +20,19 @@ from dsr.app.upsample.stored import (
     read_camera,
     read_complete,
     read_depth,
-    read_errors,
     read_result,
 )
 from dsr.geometry.mesh import FusedMesh, fuse_maps, suggest_voxel
 from dsr.geometry.poses import PosedMap, as_rigid, check_poses, visible
 from dsr.io.exports import INPUT, read_input, world_comment, write_glb, write_ply
 from dsr.io.images import read_pixels
+from dsr.io.posed_frames import read_errors
 from dsr.io.scene_files import RGBD
 from dsr.notes import Assumption, expect_no_warning
 from dsr.report.surface_page import Packed, is_view, pack_result, save_view
 from dsr.utils.console import ConsoleProgress, one_line, show
 from dsr.utils.files import expect_target
-from dsr.utils.guards import natural_key, refusing_excess
+from dsr.utils.guards import naming, natural_key, refusing_excess
 from dsr.utils.progress import megabytes, show_length
 
 _WHOLE_PAGE = 6  # the page has at most this many times the vertices of one surface
@@ -114,19 +115,23 @@ def fuse(request: FuseRequest, console: Console) -> list[str]:
     def maps() -> Iterator[PosedMap]:
         return (_load(folder, max_error) for folder in frames)
 
-    try:
+    with naming(f"{frames[0]}{' and others' if len(frames) > 1 else ''}"):
         voxel = suggest_voxel(maps()) if request.voxel is None else request.voxel
         mesh = fuse_maps(maps, voxel)
-    except ValueError as error:
-        raise ValueError(f"{frames[0]}{' and others' if len(frames) > 1 else ''}: {error}") from error
     colours = _colours(mesh.vertices, frames, max_error, _SEEN * voxel, problems)
     ups = {read_complete(folder)["up"] for folder in frames}
     frame = _write(request.output, mesh, colours, ups.pop() if len(ups) == 1 else "")
     size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, voxels of {show_length(voxel)}"
     show(console, f"{_count(frames)} -> {request.output}: {size}; in {frame}")
     if request.score:
-        show(console, f"successive results differ by {_difference(frames, max_error)} (OPW)")
-        show(console, f"distances of points spread by {_spread(recordings.values(), max_error)} of their mean (RSD)")
+        from dsr.metrics.temporal import opw, rsd  # noqa: PLC0415 - torchmetrics, which takes a second
+
+        known = _scores(recordings.values(), max_error, opw, 2, 1)
+        mean = show_length(float(np.mean(known))) if known else "nan"
+        show(console, f"successive results differ by {mean}, {len(known)} pairs of a view in common (OPW)")
+        known = _scores(recordings.values(), max_error, rsd, _VIEWS, _VIEWS)
+        spread = f"{100 * np.mean(known):.2f} %" if known else "nan"
+        show(console, f"distances of points spread by {spread} of their mean (RSD)")
     return problems
 
 
@@ -143,34 +148,18 @@ def _count(results: Sequence[object]) -> str:
     return "1 result" if len(results) == 1 else f"{len(results)} results"
 
 
-def _difference(frames: Sequence[Path], max_error: float) -> str:
-    """Return the mean difference of successive results of each recording, with its unit and how many pairs it is of."""
-    from dsr.metrics.temporal import opw  # noqa: PLC0415 - torchmetrics, which takes a second
-
-    found = []
-    for pair in itertools.pairwise(frames):
-        first, second = (_load(folder, max_error) for folder in pair)
-        if pair[0].parent == pair[1].parent and first.camera == second.camera:
-            depths = torch.from_numpy(np.stack((first.depth, second.depth)))[:, None]
-            found.append(float(opw(depths, first.camera, (first.pose, second.pose))))
-    known = [each for each in found if not math.isnan(each)]
-    mean = show_length(float(np.mean(known))) if known else "nan"
-    return f"{mean}, {len(known)} pairs of a view in common"
-
-
-def _spread(recordings: Iterable[Sequence[Path]], max_error: float) -> str:
-    """Return the mean spread of distances over a few successive views each, in per cent."""
-    from dsr.metrics.temporal import rsd  # noqa: PLC0415 - as above
-
+def _scores(
+    recordings: Iterable[Sequence[Path]], max_error: float, metric: Callable[..., Tensor], views: int, step: int
+) -> list[float]:
+    """Return a metric of each group of so many successive results of one camera, where it has a value."""
     found = []
     for recording in recordings:
-        for start in range(0, len(recording), _VIEWS):
-            views = [_load(folder, max_error) for folder in recording[start : start + _VIEWS]]
-            if len(views) > 1 and len({view.camera for view in views}) == 1:
-                depths = torch.from_numpy(np.stack([view.depth for view in views]))[:, None]
-                found.append(float(rsd(depths, views[0].camera, [view.pose for view in views])))
-    known = [each for each in found if not math.isnan(each)]
-    return f"{100 * np.mean(known):.2f} %" if known else "nan"
+        for start in range(0, len(recording) - 1, step):
+            group = [_load(folder, max_error) for folder in recording[start : start + views]]
+            if len({each.camera for each in group}) == 1:
+                depths = torch.from_numpy(np.stack([each.depth for each in group]))[:, None]
+                found.append(float(metric(depths, group[0].camera, [each.pose for each in group])))
+    return [each for each in found if not math.isnan(each)]
 
 
 def _load(folder: Path, max_error: float) -> PosedMap:
@@ -181,7 +170,7 @@ def _load(folder: Path, max_error: float) -> PosedMap:
     depth = read_depth(folder, camera).astype(np.float64)
     deviation = None
     if (folder / ERRORS).is_file():
-        deviation = np.maximum(read_errors(folder, camera)[0].astype(np.float64), _LEAST_ERROR)
+        deviation = np.maximum(read_errors(folder / ERRORS, camera)[0].astype(np.float64), _LEAST_ERROR)
         with np.errstate(invalid="ignore"):
             depth = np.where(deviation <= max_error * depth, depth, np.nan)
     return PosedMap(depth, camera, as_rigid(info["pose"], f"{path}: pose"), deviation)

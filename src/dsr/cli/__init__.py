@@ -85,7 +85,6 @@ class Parser(argparse.ArgumentParser):
         return next((dict(each.choices) for each in found), {})
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """Refuse a value that is not one of an action's choices."""
         if action.choices is not None and value not in action.choices:
             choices = [str(each) for each in action.choices]
             meant = did_you_mean(value, choices)
@@ -94,7 +93,6 @@ class Parser(argparse.ArgumentParser):
 
 class _Version(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
-        """Print it."""
         for line in version_lines():
             show(open_console(), line)
         parser.exit()

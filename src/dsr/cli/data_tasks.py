@@ -28,10 +28,7 @@ _URL = "Weights"  # the label of the release's files in ``project.urls`` of pypr
 
 
 def downloads() -> Mapping[str, Collection]:
-    """Return the data sets, and the weights that this installation does not come with, by their names.
-
-    The weights are fetched from the release, or from a mirror.
-    """
+    """Return the data sets, and the weights that this installation does not come with, by their names."""
     names = weights.left_out()
     if not names:
         return CATALOGUE

@@ -118,7 +118,6 @@ def judge(depth: Array, rgb: Tensor, zooms: Sequence[float] = _ZOOMS) -> Verdict
 
 
 def _conclude(given: Agreement, ways: dict[str, Agreement], *, contours: bool, size: tuple[int, ...]) -> Verdict:
-    """Return the verdict on the agreement as given and in other ways, of a photo of (height, width) pixels."""
     way = max(ways, key=lambda name: ways[name].significance)
     margin = ways[way].significance - max(given.significance, 0.0)
     conclusive = contours and given.spread < _SPREAD
@@ -222,7 +221,6 @@ def _transform(outlines: Outlines) -> _Fields:
 
 
 def _compare(depth: _Fields, photo: _Fields) -> Agreement:
-    """Return the agreement of the edges of a depth map with those of a photo on the same grid."""
     height, width = depth.strength.shape
     v, u = np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None]  # frequencies, and displacements over the size
     fast = (1 - np.exp(-2 * (np.pi * _SLOW) ** 2 * (v * v + u * u))).astype(np.float32)
@@ -273,7 +271,6 @@ def _bridge(depth: Array, gap: int) -> Array:
 
 
 def _blur(values: _Floats, deviation: float) -> _Floats:
-    """Return values blurred by a Gaussian."""
     return np.asarray(cv2.GaussianBlur(np.ascontiguousarray(values), (0, 0), deviation))
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import PosedMap, invert
+from dsr.geometry.poses import PosedMap, in_picture, invert
 
 LARGEST_STEP = 0.02  # relative change of a neighbour's depth, beyond what the slopes on both sides predict, that is cut
 _HALF_WIDTHS = (1, 2, 3)  # half widths of the windows in pixels
@@ -63,8 +63,6 @@ def triangulate(
     ``isolated`` keeps vertices without a triangle. ``tolerance``, (1, H, W), is the largest deviation of most pixels
     from the mesh in metres, so that flat parts get large triangles; None for a mesh of all pixels.
     """
-    if tuple(depth.shape) != (1, camera.height, camera.width):
-        raise ValueError(f"depth: expected shape {(1, camera.height, camera.width)}, got {tuple(depth.shape)}")
     strided = depth[0, ::stride, ::stride].detach().cpu().double().numpy()
     allowed = None
     if tolerance is not None:
@@ -289,8 +287,6 @@ def fuse_maps(maps: Callable[[], Iterable[PosedMap]], voxel: float) -> FusedMesh
     where the average is 0, by marching cubes (Lewiner et al. 2003). Only blocks of 8 x 8 x 8 voxels near a surface are
     stored (Niessner et al. 2013). ``maps`` yields the maps; it is called twice, and one map is held at a time.
     """
-    if not 0 < voxel < np.inf:
-        raise ValueError(f"voxel: expected a positive number of metres, got {voxel}")
     blocks = _touched_blocks(maps(), voxel)
     layer = math.prod(int(extent) + 1 for extent in np.ptp(blocks[:, :2], axis=0))  # of any size
     excess = max(len(blocks) / MOST_BLOCKS, layer / _LARGEST_LAYER)
@@ -337,13 +333,9 @@ def _integrate(
     world = voxel * (_SIDE * blocks.T[:, :, None] + inner).reshape(3, -1).astype(np.float64)
     to_camera = invert(each.pose)
     x, y, z = to_camera[:3, :3] @ world + to_camera[:3, 3:]
-    camera = each.camera
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    inside = (z > 0) & (u > -0.5) & (v > -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
+    u, v, inside = in_picture(each.camera, x, y, z)
     places = np.flatnonzero(inside)
     columns, rows = np.rint(u[places]).astype(np.intp), np.rint(v[places]).astype(np.intp)
-    columns, rows = columns.clip(0, camera.width - 1), rows.clip(0, camera.height - 1)
     gap = (each.depth[rows, columns] - z[places]) / (_TRUNCATION * voxel)
     certain = np.ones(len(places)) if each.deviation is None else (voxel / each.deviation[rows, columns]) ** 2
     seen = (gap >= -1) & (certain > 0) & np.isfinite(certain)
@@ -355,7 +347,6 @@ def _integrate(
 
 
 def _extract(blocks: NDArray[np.int64], distance: np.ndarray, weight: np.ndarray, voxel: float) -> FusedMesh:
-    """Return the triangles where the distance is 0, one layer of blocks after the other."""
     low = blocks.min(0)
     size = tuple(_SIDE * (blocks.max(0) - low + 1)[:2] + 1)
     vertices, normals, faces, count = [], [], [], 0

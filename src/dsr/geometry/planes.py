@@ -138,7 +138,6 @@ def thinned(values: Array, camera: Camera) -> tuple[Array, Camera]:
 
 
 def _windows(values: Array, camera: Camera) -> _Windows:
-    """Return the windows of a map that have enough valid pixels."""
     valid = np.isfinite(values)
     with np.errstate(over="ignore"):
         inverse = np.where(valid, np.nanmedian(values) / values, 0).clip(max=_LARGEST)

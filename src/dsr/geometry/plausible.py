@@ -68,11 +68,9 @@ def expect_possible(camera: Camera, name: str) -> None:
     beyond = (max(-0.5 - middle, middle - size + 0.5, 0) / focal for middle, size, focal in axes)
     angle = math.degrees(math.atan(math.hypot(*beyond)))
     if angle > LIMITS["beside-axis"]:
-        raise ValueError(
-            f"{name}: expected a principal point in or near the picture of {camera.width} x {camera.height} pixels "
-            f"(width x height), got cx {camera.cx:g} and cy {camera.cy:g} with fx {camera.fx:g} and fy {camera.fy:g}, "
-            f"from which the picture is {angle:.4g} degrees away"
-        )
+        size = f"{camera.width} x {camera.height} pixels (width x height)"
+        got = f"cx {camera.cx:g} and cy {camera.cy:g} with fx {camera.fx:g} and fy {camera.fy:g}"
+        raise ValueError(f"{name}: expected a principal point in or near the picture of {size}, got {got}")
 
 
 def plausible_baseline(baseline: float) -> bool:

@@ -91,12 +91,17 @@ def relative(pose: Matrix, to: Matrix) -> Matrix:
     return invert(to) @ pose
 
 
+def in_picture(camera: Camera, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return columns and rows of points in a camera's frame, of any shape, and which are in its picture."""
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    return u, v, (z > 0) & (u > -0.5) & (v > -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
+
+
 def visible(points: np.ndarray, camera: Camera, pose: Matrix) -> tuple[np.ndarray, ...]:
     """Return which of some points in the world, (N, 3), are in a picture, their places in it, (M, 2), and depths."""
     x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    inside = (z > 0) & (u > -0.5) & (v > -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
+    u, v, inside = in_picture(camera, x, y, z)
     found = np.flatnonzero(inside)
     return found, np.stack((u[found], v[found]), axis=1), z[found]
 
@@ -187,7 +192,6 @@ class _Reduced(NamedTuple):
 
 
 def _prepare(each: PosedMap) -> _Reduced:
-    """Return a frame to compare."""
     step = min(-(-each.camera.width // _WIDEST), each.camera.height)
     camera = each.camera.decimate(step, step // 2)
     depth = each.depth[step // 2 :: step, step // 2 :: step][: camera.height, : camera.width]
@@ -204,11 +208,10 @@ def _prepare(each: PosedMap) -> _Reduced:
 def _compare(frame: _Reduced, other: _Reduced) -> tuple[np.ndarray, np.ndarray]:
     """Return overlap and agreement of another frame's points with a frame, (readings + 1,) each."""
     camera, back = frame.camera, frame.poses[:, :3, :3].transpose(0, 2, 1)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         turn, shift = back @ other.poses[:, :3, :3], back @ (other.poses[:, :3, 3:] - frame.poses[:, :3, 3:])
         x, y, z = np.moveaxis(turn @ other.points + shift, 1, 0)  # (readings + 1, points) each
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    inside = (z > 0) & (u > -0.5) & (v > -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
+    u, v, inside = in_picture(camera, x, y, z)
     rows, columns = (np.rint(np.where(inside, each, 0)).astype(np.intp) for each in (v, u))
     seen = np.where(inside, frame.depth[rows, columns], np.nan)
     count = np.isfinite(seen).sum(1)
@@ -217,10 +220,7 @@ def _compare(frame: _Reduced, other: _Reduced) -> tuple[np.ndarray, np.ndarray]:
 
 
 def check_poses(count: int, load: Callable[[int], PosedMap | None]) -> Assumption | None:
-    """Return a warning where frames disagree under the poses as given; None if they show too little.
-
-    Some frames of a sequence are compared; ``load`` returns one, or None if it has no pose.
-    """
+    """Return a warning if frames, which ``load`` returns, disagree under their poses; None if they show too little."""
     pairs: list[tuple[_Reduced, _Reduced]] = []
     for group in sample(count):
         pairs += itertools.combinations([_prepare(each) for each in map(load, group) if each is not None], 2)

@@ -219,7 +219,6 @@ def _mean_gradients(each: Iterable[Edges], gradients: Gradients, radius: int) ->
 
 
 def _standard_errors(gains: Array) -> float:
-    """Return the sum over the tiles, in standard errors."""
     return float(gains.sum() / max(np.sqrt(np.square(gains).sum()), 1e-12))
 
 

@@ -113,9 +113,7 @@ class AnyRatio(Method):
         """Check that a working size other than the map's own has an effect with this method and scale."""
         size = self._working_size
         if size not in (None, 1) and not self._may_reduce:
-            raise ValueError(
-                f"working_size: expected facets without a scale, for maps that may have noise, to take {size}"
-            )
+            raise ValueError(f"working_size: expected facets without a scale, for maps that may have noise, got {size}")
 
     def plan(self, size: tuple[int, int], size_lr: tuple[int, int]) -> Plan:
         """Return the plan for a photo and a depth map of these heights and widths."""
@@ -151,21 +149,13 @@ class AnyRatio(Method):
     ) -> Surface:
         """Upsample a depth map, (1, h, w) in metres with NaN in holes, to the size of a photo, (3, H, W) in [0, 1].
 
-        Both are registered: the same view and field of view, outer edge on outer edge. ``facets`` states the expected
-        errors; for other methods they are estimated, see :mod:`dsr.inference.plausibility`, unless not
-        ``estimate_errors``.
+        Both are registered: the same view and field of view, outer edge on outer edge; the camera is the photo's. The
+        depth is (1, H, W) float32, as its errors on the device of ``depth``. ``facets`` states the expected errors; for
+        other methods they are estimated, see :mod:`dsr.inference.plausibility`, unless not ``estimate_errors``.
 
-        Args:
-            camera: the photo's; only interpolation and deep image priors depend on it.
-            sensor: what measured the map: of :func:`~dsr.inference.find_sensor`, or its argument; None for none. No
-                expected error is less than what remains of the sensor's least noise, and a systematic error of which
-                its maker states a limit is added. If it counts disparity, see also
-                :func:`~dsr.inference.working_size.known_noise`.
-
-        Returns:
-            Depth, (1, H, W) float32 in metres, its expected errors, and which depth is filled in, on the device of
-            ``depth``; and its outliers.
-
+        ``sensor``: what measured the map: of :func:`~dsr.inference.find_sensor`, or its argument; None for none. No
+        expected error is less than what remains of the sensor's least noise, and a systematic error of which its maker
+        states a limit is added. If it counts disparity, see also :func:`~dsr.inference.working_size.known_noise`.
         """
         expect_picture(rgb, depth, camera)
         planned = self.plan(size_of(rgb), size_of(depth))  # raises ValueError for sizes or a scale that cannot be used
@@ -214,10 +204,7 @@ class AnyRatio(Method):
         self, rgb: Tensor, measured: Tensor, inverse: Tensor, camera: Camera, sensor: Identified | None,
         progress: Steps | None,
     ) -> InverseSurface:  # fmt: skip
-        """Return high-resolution inverse depth of inverse depth, (1, h, w), whose size may be divided first.
-
-        The noise is that of the ``measured`` one, some of whose holes are filled in the other.
-        """
+        """Return high-resolution inverse depth, at a size that the noise of the ``measured`` one suggests."""
         noise, factor = self._choose_size(measured, camera)
         known = None if "noise" in self.recipe.settings else known_noise(sensor, noise, factor)
         if factor == 1:
@@ -261,7 +248,6 @@ class AnyRatio(Method):
         return at_factors([(step, self._method(step)) for step in planned.steps], rgb, inverse, camera, progress)
 
     def _method(self, factor: int) -> Method:
-        """Return the method for a factor, which is built once."""
         if factor not in self._methods:
             try:
                 self._methods[factor] = self.recipe.build(factor, self._run, **_DECIDED)
@@ -278,10 +264,7 @@ class AnyRatio(Method):
 
 
 def finds_noise(recipe: Recipe) -> bool:
-    """Return whether a method may work at a size that the map's noise suggests.
-
-    It has to have weights for several ratios of the sizes, and no setting that there is no noise.
-    """
+    """Return whether a method has weights for several ratios, of which the noise of a map may suggest one."""
     return bool(recipe.computed_at) and not is_told_clean(recipe)
 
 

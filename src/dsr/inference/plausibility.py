@@ -62,10 +62,7 @@ def find_outliers(depth: Tensor) -> Tensor:
 
 
 def find_filled(result: Tensor, depth: Tensor) -> Tensor:
-    """Return where a result, (1, H, W), has depth that was not measured: the nearest pixel of the map is missing.
-
-    A pixel of the map, (1, h, w) in metres, is missing if it is a hole, NaN, or an outlier.
-    """
+    """Return where a result, (1, H, W), has depth whose nearest pixel of the map, (1, h, w), is a hole or outlier."""
     missing = depth.isnan() | find_outliers(depth)
     return resize_nearest(missing, size_of(result)).to(result.device) & result.isfinite()
 

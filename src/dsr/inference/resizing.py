@@ -61,13 +61,6 @@ def plan_for(recipe: Recipe, photo_size: Size, depth_size: Size, scale: int | No
     ``scale`` is the factor; None to choose it by the sizes, 4 if they are equal. A ValueError if the method has no
     weights for it, or the sizes do not fit together. This plan does not apply to a depth map of the photo's size that
     was enlarged by repeating pixels: it is upsampled from the low-resolution map that it was before.
-
-    Example:
-        >>> from dsr.inference.resizing import plan_for
-        >>> from dsr.methods.recipe import read_recipe
-        >>> plan_for(read_recipe("facets"), (1440, 1920), (192, 256)).scale  # of a phone's depth
-        8
-
     """
     method, abilities, factors = recipe.name, recipe.abilities, steps_of(recipe)
     ratio = _ratio(photo_size, depth_size)
@@ -98,7 +91,6 @@ def plan_for(recipe: Recipe, photo_size: Size, depth_size: Size, scale: int | No
 
 
 def _ratio(photo_size: Size, depth_size: Size) -> float:
-    """Return how much larger the photo is than the depth map."""
     if min(*photo_size, *depth_size) < 1:
         raise ValueError(f"sizes: expected positive ones, got a photo of {photo_size} and depth of {depth_size}")
     down, across = photo_size[0] / depth_size[0], photo_size[1] / depth_size[1]
@@ -112,7 +104,6 @@ def _ratio(photo_size: Size, depth_size: Size) -> float:
 
 
 def _scale(requested: int | None, ratio: float, method: str, factors: Mapping[int, tuple[int, ...]]) -> int:
-    """Return the requested factor, or the smallest that reaches the photo's size."""
     if not factors:
         if requested is not None and requested < 1:
             raise ValueError(f"scale: expected a positive whole number, got {requested}")
@@ -121,9 +112,8 @@ def _scale(requested: int | None, ratio: float, method: str, factors: Mapping[in
         raise ValueError(f"scale: expected one of {', '.join(map(str, sorted(factors)))} for {method}, got {requested}")
     enough = [scale for scale in sorted(factors) if ratio <= SLACK * scale]
     if requested is None and not enough:
-        raise ValueError(
-            f"depth: expected at least 1/{max(factors)} of the photo's size for {method}, got 1/{ratio:.3g}"
-        )
+        least = f"1/{max(factors)} of the photo's size for {method}"
+        raise ValueError(f"depth: expected at least {least}, got 1/{ratio:.3g}")
     return requested or enough[0]
 
 
@@ -146,10 +136,7 @@ def at_ratio(
 def at_factors(
     stages: Sequence[tuple[int, Method]], rgb: Tensor, inverse: Tensor, camera: Camera, progress: Steps | None
 ) -> InverseSurface:
-    """Run methods in turn, each at its factor and on the result of the one before, and resize the last one's result.
-
-    The photo is (3, H, W), and the camera is its; the map is (1, h, w).
-    """
+    """Run methods in turn, each at its factor on the result before; the last result gets the photo's size."""
     size = size_of(rgb)
     sizes = [size_of(inverse)]  # of the low-resolution map of each stage
     sizes += [(-(-size[0] // factor), -(-size[1] // factor)) for factor, _ in stages[1:]]

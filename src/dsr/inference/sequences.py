@@ -38,9 +38,6 @@ class View:
     pose: Matrix  # from the camera's frame (x right, y down, z forward) to the world's, 4 x 4, metres
 
     def __post_init__(self) -> None:
-        shape = (1, self.camera.height, self.camera.width)
-        if tuple(self.depth.shape) != shape:
-            raise ValueError(f"depth: expected shape {shape}, the camera's, got {tuple(self.depth.shape)}")
         object.__setattr__(self, "pose", as_rigid(self.pose, "pose"))
 
     @functools.cached_property
@@ -61,19 +58,7 @@ class Fused(NamedTuple):
 
 
 def fuse_views(reference: View, neighbours: Sequence[View]) -> Fused:
-    """Fuse the depth of neighbouring frames, which see the same surfaces, into that of a reference frame.
-
-    Example:
-        >>> import numpy as np
-        >>> import torch
-        >>> import dsr
-        >>> from dsr.inference.sequences import View, fuse_views
-        >>> camera, random = dsr.Camera.from_fov(60, width=64, height=48), torch.Generator().manual_seed(0)
-        >>> views = [View(2 + 0.01 * torch.randn((1, 48, 64), generator=random), camera, np.eye(4)) for _ in range(5)]
-        >>> bool(fuse_views(views[0], views[1:]).depth.std() < 0.6 * views[0].depth.std())
-        True
-
-    """
+    """Fuse the depth of neighbouring frames, which see the same surfaces, into that of a reference frame."""
     noise = float(np.median([view.noise for view in (reference, *neighbours)]))  # they are of one sensor
     own = reference.depth[0].double().reciprocal()
     readings = [(own, torch.full_like(own, _deviation(own, noise)))]

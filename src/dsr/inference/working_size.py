@@ -143,19 +143,13 @@ def known_noise(sensor: Identified | None, noise: MapNoise | None, factor: int) 
 
 
 def working_size_of(extent: float) -> int:
-    """Return the divisor of the map's size for noise: a power of 2 from 4 on, or 1.
-
-    ``extent`` is the full width at half maximum of the noise's autocorrelation in pixels.
-    """
+    """Return the divisor of the map's size, 1 or a power of 2 from 4 on, for noise of a full width at half maximum."""
     factor = 2 ** int(math.log2(max(extent / _LENGTHS, 1)))
     return 1 if factor < SIZES[2] else min(factor, SIZES[-1])
 
 
 def reduce_by_medians(inverse: Tensor, factor: int) -> Tensor:
-    """Return the medians of blocks of inverse depth, (1, h, w) with sides that the factor divides.
-
-    A block of which less than a quarter is known is a hole.
-    """
+    """Return the medians of blocks of inverse depth, (1, h, w), holes where less than a quarter of a block is known."""
     _, height, width = inverse.shape
     blocks = inverse.view(height // factor, factor, width // factor, factor).transpose(1, 2).flatten(2)
     known = blocks.isfinite().sum(dim=2) >= factor**2 / 4

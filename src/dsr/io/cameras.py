@@ -118,7 +118,6 @@ def _of_json(path: Path, text: str) -> CameraFile:
 
 
 def _metres(unit: Any) -> Any:
-    """Return metres per value for the name of a unit, and anything else as it is."""
     if not isinstance(unit, str):
         return unit
     if unit not in _METRES:
@@ -174,7 +173,6 @@ class _Open3d(BaseModel, strict=True):
 def _fit_to_photo(
     path: Path, content: CameraFile | np.ndarray, size: Size, size_lr: Size, photo: Path
 ) -> tuple[CameraFile, list[Assumption]]:
-    """Return the camera of a file for the pixels of the photo, and the assumptions."""
     assumptions: list[Assumption] = []
     if isinstance(content, np.ndarray):
         content, assumptions = _camera_of_matrix(path, content, size, size_lr)

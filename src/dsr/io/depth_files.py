@@ -83,9 +83,7 @@ def write_depth_file(path: Path, values: np.ndarray) -> None:
         else:
             predictor = 3 if values.dtype.kind == "f" else 2
             how = {".png": [cv2.IMWRITE_PNG_COMPRESSION, 6]}.get(suffix, [_COMPRESSION, 8, _PREDICTOR, predictor])
-            written, content = cv2.imencode(suffix, values, how)
-            if not written:
-                raise ValueError(f"{path}: {values.shape[0]} x {values.shape[1]} pixels could not be encoded")
+            _, content = cv2.imencode(suffix, values, how)
             temporary.write_bytes(content.tobytes())
 
 

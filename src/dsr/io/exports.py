@@ -65,10 +65,7 @@ def write_ply(
     filled: np.ndarray | None = None,
     frame: str = CAMERA_FRAME,
 ) -> None:
-    """Write a binary PLY file of points (N, 3), their colours (N, 3) uint8 and normals (N, 3), and faces (M, 3).
-
-    ``filled``, (N,) bool, whether points were not measured, is a property of that name; ``frame`` is a comment.
-    """
+    """Write a binary PLY file of points (N, 3), colours (N, 3) uint8, normals, faces (M, 3) and flags ``filled``."""
     import trimesh  # noqa: PLC0415 - half a second that most results save
     from trimesh.exchange.ply import export_ply  # noqa: PLC0415
 
@@ -95,10 +92,7 @@ class Written(NamedTuple):
 
 
 def normal_strips(depth: Tensor, camera: Camera) -> Iterator[tuple[slice, Tensor]]:
-    """Yield the rows of one strip after another, and its normals, (3, rows, W) float32, NaN where unknown.
-
-    The strips together are what :func:`dsr.geometry.surface.depth_to_normals` gives for the whole map, (1, H, W).
-    """
+    """Yield the rows of one strip after another, and its normals, (3, rows, W) float32, NaN where unknown."""
     height, width = camera.height, camera.width
     rows = max(1, _STRIP // width)
     for start in range(0, height, rows):
@@ -178,9 +172,6 @@ def write_mesh(
     that was not measured, is a property of a PLY file's points, and the attribute ``_FILLED`` of a GLB file.
     """
     paths = [paths] if isinstance(paths, Path) else list(paths)
-    for path in paths:  # before anything is written
-        if path.suffix.lower() not in (".ply", ".glb"):
-            raise ValueError(f"{path}: expected a mesh file, .ply or .glb, got {path.suffix or 'no suffix'}")
     mesh = triangulate(depth, camera, tolerance=tolerance)
     if not len(mesh.faces):
         raise ValueError(f"{paths[0]}: expected neighbours of known depth to make a surface of, got none")
@@ -302,10 +293,7 @@ def write_stereo(path: Path, rgb: Tensor, depth: Tensor, camera: Camera) -> list
 
 
 def write_rgbd_picture(path: Path, rgb: Tensor, depth: Tensor, _camera: Camera) -> list[Assumption]:
-    """Write a PNG of the photo and, at its right, its inverse depth as grey from far, black, to near, white.
-
-    Holes of the depth, (1, H, W) in metres, continue what is behind them.
-    """
+    """Write a PNG of the photo and, at its right, inverse depth as grey; holes continue what is behind them."""
     inverse, _ = _filled(depth[0].double().reciprocal().nan_to_num(-1.0).numpy())
     far, near = np.quantile(inverse, (1 - _NEARLY_ALL, _NEARLY_ALL))
     grey = as_bytes(torch.from_numpy((inverse - far) / max(near - far, np.finfo(float).tiny)))

@@ -13,6 +13,7 @@ from dsr.io.inputs import read_map
 from dsr.io.photos import read_photo
 from dsr.io.reading import Reading, parse_unit
 from dsr.notes import in_python, warn
+from dsr.utils.guards import naming
 
 
 def read(path: str | os.PathLike[str], depth: np.ndarray | None = None) -> np.ndarray:
@@ -106,10 +107,8 @@ def metres_in(unit: str | float | None) -> float | Literal["sunrgbd"] | None:
         return None
     if unit == "sunrgbd":
         return "sunrgbd"
-    try:
+    with naming("unit"):
         return parse_unit(str(unit))
-    except ValueError as error:
-        raise ValueError(f"unit: {error}") from error
 
 
 @contextmanager

@@ -72,14 +72,10 @@ class Rig(NamedTuple):
 
 
 class Geometry(NamedTuple):
-    """Cameras, lenses and poses of a frame as its capture states them; None where it does not.
-
-    ``pose``: camera to world, (4, 4) float64 in metres, rigid, of the camera's frame x right, y down, z forward; the
-    world's frame is the capture's own.
-    """
+    """Cameras, lenses and poses of a frame as its capture states them; None where it does not."""
 
     camera: Camera | None = None  # of a size of its own, which is scaled to the photo's
-    pose: np.ndarray | None = None
+    pose: np.ndarray | None = None  # camera (x right, y down, z forward) to the capture's world, (4, 4), rigid, metres
     assumptions: tuple[Assumption, ...] = ()
     lens: Lens | None = None  # of the photo, and of a depth map without a rig, which lies in the photo's pixels
     rig: Rig | None = None  # the depth map's camera, of a size of its own as well; None if it is in the photo's view
@@ -104,26 +100,15 @@ def accuracy_notes(*, absolute: bool, stated: bool) -> list[Assumption]:
 
 @dataclass(frozen=True)
 class CaptureFrame:
-    """What a capture states of one frame.
+    """What a capture states of one frame."""
 
-    Args:
-        app: name of the app or data set, for messages.
-        geometry: cameras and pose; or returns them for a photo of (height, width) pixels, if they depend on it or on a
-            file of the frame.
-        description: file that describes camera and pose.
-        content: the part of it that this frame depends on, which identifies it in ``info.json``.
-        photo, depth: where they are, if they are no files of their own.
-        apart: whether the depth map may be of a camera beside the photo's, so that it is of no use without that.
-
-    """
-
-    app: str
-    geometry: Geometry | Callable[[Size], Geometry]
-    description: Path
-    content: bytes
-    photo: Source | None = None
-    depth: Source | None = None
-    apart: bool = False
+    app: str  # or data set, for messages
+    geometry: Geometry | Callable[[Size], Geometry]  # or for a photo of (height, width), if it depends on it or a file
+    description: Path  # file that describes camera and pose
+    content: bytes  # the part of it that this frame depends on, which identifies it in info.json
+    photo: Source | None = None  # if it is no file of its own
+    depth: Source | None = None  # likewise
+    apart: bool = False  # whether depth may be of a camera beside the photo's, and of no use without that
 
     def geometry_of(self, size: Size) -> Geometry:
         """Return cameras and pose for a photo of (height, width), of which some may be damaged."""
@@ -177,7 +162,6 @@ def find_highest(paths: Sequence[Path]) -> float:
 
 
 def _read_values(path: Path, most: int | None = None) -> np.ndarray:
-    """Return a confidence map as it is stored, (h, w)."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a confidence map, there is no such file")
     values = read_array(path, most)

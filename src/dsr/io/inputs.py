@@ -220,7 +220,6 @@ class _Values(NamedTuple):
 def _interpret(
     pair: Pair, reading: Reading, described: CameraFile, stored: np.ndarray, units: FolderUnits, camera: Camera
 ) -> _Values:
-    """Return what the values of a pair's map are, (h, w), which ``camera`` has taken."""
     range_type, notes = _range_type(pair, reading, described)
     hole_value = described.hole_value if reading.hole_value is None else reading.hole_value
     meaning = _unit(pair, reading, described, range_type, stored)
@@ -301,7 +300,6 @@ def _undistorted(
 
 
 def _cut(pixels: np.ndarray, factor: int | None, size_lr: Size, notes: list[Assumption]) -> np.ndarray:
-    """Return the part of a photo that a depth map with ``factor`` times larger pixels covers."""
     if factor is None:
         return pixels
     size = size_lr[0] * factor, size_lr[1] * factor
@@ -314,7 +312,6 @@ def _cut(pixels: np.ndarray, factor: int | None, size_lr: Size, notes: list[Assu
 
 
 def _expect_lower_resolution(pair: Pair, size: Size, size_lr: Size) -> None:
-    """Check that a depth map of size ``size_lr`` may belong to a photo of size ``size``."""
     (height, width), (low, narrow) = size, size_lr
     what = f"the photo {pair.rgb.name} has {width} x {height} (width x height)"
     if low > height or narrow > width:
@@ -393,7 +390,6 @@ def _to_photo(
 
 
 def _camera_source(pair: Pair, reading: Reading) -> str:
-    """Return what says where the photo's principal point is."""
     if reading.camera.intrinsics is not None:
         return "--intrinsics"
     capture = None if pair.capture is None else pair.capture.description

@@ -126,7 +126,7 @@ def _find_in(folder: Path, root: Path) -> PairingResult:
             break
     else:
         listed = add_transforms(folder, PairingResult(())) or find_colmap(folder)
-        return listed or find_capture(folder, last=True) or found
+        return listed or find_capture(folder, fallback=True) or found
     camera = find_camera_file(folder, root)
     if camera is not None:
         found = replace(found, pairs=tuple(replace(pair, camera=pair.camera or camera) for pair in found.pairs))
@@ -162,7 +162,6 @@ def _add_calibration(folder: Path, found: PairingResult) -> PairingResult:
 
 
 def _scene(folder: Path) -> PairingResult:
-    """Return the pair of a scene of dsr, with its low-resolution map of the smallest factor if it has one."""
     photo = next((folder / name for name in ("rgb.png", "rgb.jpg", "rgb.jpeg") if (folder / name).is_file()), None)
     camera, mask = folder / "camera.json", folder / "mask.png"
     if photo is None or not camera.is_file():
@@ -178,7 +177,6 @@ def _scene(folder: Path) -> PairingResult:
 
 
 def _tum(folder: Path) -> PairingResult:
-    """Return the pairs of TUM's lists of times and files, and the poses of its ground truth."""
     lists = folder / "rgb.txt", folder / "depth.txt"
     if not all(path.is_file() for path in lists):
         return PairingResult(())
@@ -208,7 +206,6 @@ def _tum(folder: Path) -> PairingResult:
 
 
 def _timed(path: Path) -> dict[Path, float]:
-    """Return the files in a list of TUM RGB-D, with their times in seconds."""
     times: dict[Path, float] = {}
     for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split()

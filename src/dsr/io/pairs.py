@@ -52,14 +52,11 @@ def words_of(name: str) -> list[str]:
 
 
 def role_of(path: Path) -> Role:
-    """Return the role of a file by its suffix and the words of its name, ``rgb`` where they say nothing."""
-    suffix = path.suffix.lower()
+    """Return the role of a picture by its suffix and the words of its name, ``rgb`` where they say nothing."""
     found = role_of_words(words_of(path.stem))
-    if found == "other" or suffix not in (*PHOTO_SUFFIXES, *READ_SUFFIXES):
-        return "other"
-    if suffix in _DEPTH_ONLY:
+    if found != "other" and path.suffix.lower() in _DEPTH_ONLY:
         return "depth"
-    return "rgb" if found is None else found
+    return found or "rgb"
 
 
 def role_of_words(words: Iterable[str]) -> Role | None:

@@ -40,7 +40,6 @@ _DAMAGED = (ValueError, RuntimeError, SyntaxError, EOFError, OSError, IndexError
 
 
 def _turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Return a photo, (H, W, 3), turned as an EXIF orientation says."""
     exchange, rows, columns = _TURNS[orientation]
     return (pixels.transpose(1, 0, 2) if exchange else pixels)[::rows, ::columns]
 
@@ -176,17 +175,12 @@ def write_png(path: Path, picture: np.ndarray, known: np.ndarray | None = None) 
 
 
 def encode_png(picture: np.ndarray) -> bytes:
-    """Return a picture, (H, W) or (H, W, 2, 3 or 4) blue first, uint8 or uint16, as a PNG; OSError if it cannot be.
-
-    Two channels are grey and opacity, of 8 bits. Level 6 takes half the space of OpenCV's own level for depth.
-    """
+    """Return a picture, (H, W) or (H, W, 2, 3 or 4) blue first, uint8 or uint16, as a PNG; 2: grey and opacity."""
     if picture.ndim == 3 and picture.shape[2] == 2:  # which OpenCV would write as four
         content = io.BytesIO()
         Image.fromarray(picture).save(content, "PNG", compress_level=_LEVEL)
         return content.getvalue()
-    done, encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, _LEVEL])
-    if not done:
-        raise OSError(f"the picture of {picture.shape} could not be encoded")
+    _, encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, _LEVEL])
     return encoded.tobytes()
 
 
@@ -198,9 +192,7 @@ def to_jpeg(pixels: np.ndarray, longest: int, quality: int) -> bytes:
         size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
         pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
-    done, content = cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), options)
-    if not done:
-        raise OSError(f"the picture of {pixels.shape} could not be encoded")
+    _, content = cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), options)
     return content.tobytes()
 
 

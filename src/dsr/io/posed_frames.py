@@ -14,10 +14,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from torch import Tensor
 
 from dsr.geometry.camera import Camera
-from dsr.geometry.poses import quaternion_of, visible
+from dsr.geometry.poses import Matrix, quaternion_of, visible
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import whole_normals
 from dsr.io.images import read_pixels
@@ -42,12 +41,12 @@ class Frame:
 
     name: str  # perhaps with folders: kitchen/000012
     camera: Camera
-    pose: Tensor | None  # (4, 4) float64 camera to world in metres; None if it is not known
+    pose: Matrix | None  # (4, 4) camera to world in metres; None if it is not known
     colour: Path  # an 8-bit PNG
     depth: Path  # a file of (H, W) orthogonal depth in metres, NaN in holes
     up: str = ""  # the axis of the world that points up, one of dsr.io.frames.UPS
     time: float | None = None  # in seconds
-    errors: Path | None = None  # an NPZ file of ``depth_error``, (H, W) in metres; None if it is not known
+    errors: Path | None = None  # an NPZ file, see :func:`read_errors`; None if it is not known
     max_error: float = 0.02  # expected error, as a fraction of the depth, beyond which a pixel is not used as a point
 
     @property
@@ -56,9 +55,9 @@ class Frame:
         return self.name.replace("/", "_")
 
     @property
-    def matrix(self) -> np.ndarray:
+    def matrix(self) -> Matrix:
         """The pose, (4, 4); a frame without one stands at the origin."""
-        return np.eye(4) if self.pose is None else self.pose.numpy()
+        return np.eye(4) if self.pose is None else self.pose
 
     def read_depth(self) -> np.ndarray:
         """Return the depth, (H, W) float32 in metres, NaN in holes."""
@@ -66,26 +65,27 @@ class Frame:
         expect_size(f"{self.depth}: expected depth of", values, (self.camera.height, self.camera.width))
         return values.astype(np.float32)
 
-    def read_errors(self) -> np.ndarray | None:
-        """Return the expected error of the depth, (H, W) float32 in metres; None if it is not known."""
-        if self.errors is None:
-            return None
-        values = read_arrays(self.errors, ("depth_error",)).get("depth_error", np.empty(0))
-        if values.shape != (self.camera.height, self.camera.width):
-            raise ValueError(f"{self.errors}: expected depth_error of the depth map's shape, got {values.shape}")
-        return values.astype(np.float32)
-
     def read_certain(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the depth without pixels that are expected to be off by more than ``max_error``, and these errors."""
-        depth, errors = self.read_depth(), self.read_errors()
-        if errors is None:
+        depth = self.read_depth()
+        if self.errors is None:
             return depth, np.full(depth.shape, np.nan)
+        errors, _ = read_errors(self.errors, self.camera)
         return np.where(errors <= self.max_error * depth, depth, np.float32(np.nan)), errors
 
     def read_colour(self) -> np.ndarray:
         """Return the photo, (H, W, 3) uint8, red first."""
         most = pixels_beside(self.camera.height, self.camera.width)
         return read_pixels(self.colour, cv2.IMREAD_COLOR, most)[..., ::-1]
+
+
+def read_errors(path: Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return the expected errors of depth and normal, (H, W) float32 each, in metres and degrees, of a result."""
+    arrays, size = read_arrays(path, ("depth_error", "angle_error")), (camera.height, camera.width)
+    if len(arrays) < 2 or not all(each.shape == size and each.dtype.kind == "f" for each in arrays.values()):
+        came = ", ".join(f"{name} {each.dtype} {each.shape}" for name, each in arrays.items()) or "neither"
+        raise ValueError(f"{path}: expected depth_error and angle_error of shape {size}, the photo's, got {came}")
+    return arrays["depth_error"].astype(np.float32), arrays["angle_error"].astype(np.float32)
 
 
 class Points(NamedTuple):

@@ -7,7 +7,7 @@ principal point from the corner of the image, half a pixel more.
 import importlib
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,24 +19,13 @@ from dsr.geometry.camera import Camera
 from dsr.io.exports import as_bytes, world_comment, write_normals, write_ply
 from dsr.io.photos import encode_png, to_jpeg, write_png
 from dsr.io.posed_frames import Frame, colmap_model, initial_gaussians, sample_points
-from dsr.io.trajectories import check_pose
 from dsr.notes import Assumption
 from dsr.utils.files import replacing, write_text
-from dsr.utils.guards import refusing
-from dsr.utils.versions import how_to_install
 
 _Value = TypeVar("_Value")
 NORMALS = "normals_from_pretrain"  # a folder that dn-splatter looks for
 RGBD = ("color.png", "depth.png", "intrinsic.json")
 _MILLIMETRES, _STEPS = 1000, 65535  # of a metre, and of 16 bits
-
-
-def parse_pose(where: str, value: object) -> Tensor | None:
-    """Return a camera-to-world transform, (4, 4) float64, that JSON holds as a list of lists; None for none."""
-    if value is None:
-        return None
-    with refusing(f"{where}: expected a rigid transform of 4 x 4 numbers, got {value}", TypeError, ValueError):
-        return torch.from_numpy(check_pose(where, np.array(value, dtype=np.float64)))
 
 
 def _common(values: Sequence[_Value]) -> _Value | None:
@@ -45,32 +34,16 @@ def _common(values: Sequence[_Value]) -> _Value | None:
 
 
 def to_millimetres(depth: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return depth in metres as whole millimetres, (H, W) uint16 with 0 in holes, and how many pixels are too far.
-
-    Depth of 65.535 m and more does not fit, and becomes a hole.
-    """
+    """Return depth in metres as millimetres, (H, W) uint16, 0 in holes and beyond 65.535 m, and how many are beyond."""
     values = np.rint(depth.astype(np.float64) * _MILLIMETRES)
     fits = (values > 0) & (values <= _STEPS)
     return np.where(fits, values, 0).astype(np.uint16), int((values > _STEPS).sum())
 
 
-def expect_poses(part: str, known: Mapping[str, bool]) -> None:
-    """Refuse frames, by name with whether they have a pose, of which one has none; a single one needs none."""
-    missing = [name for name, has in known.items() if not has]
-    if missing and len(known) > 1:
-        raise ValueError(
-            f"{part}: expected a pose of each frame, got none for {len(missing)} of {len(known)}, such as "
-            f"{missing[0]}; --poses gives them"
-        )
-
-
 def _write_pictures(
     folder: Path, kinds: tuple[str, str], frame: Frame, values: np.ndarray, known: np.ndarray | None = None
 ) -> list[Path]:
-    """Write the photo and values of the depth, (H, W) uint16, of a frame into two folders, and return the files.
-
-    ``known``, (H, W) bool, the pixels with depth, makes a mask in ``masks/``, too, 255 there and 0 in holes.
-    """
+    """Write a frame's photo, values of its depth, (H, W) uint16, and a mask if some are ``known``; return the files."""
     photo, depth, mask = (folder / kind / f"{frame.stem}.png" for kind in (*kinds, "masks"))
     with replacing(photo) as temporary:
         shutil.copyfile(frame.colour, temporary)
@@ -87,10 +60,7 @@ def _have_holes(frames: Sequence[Frame]) -> bool:
 
 
 def write_rgbd(folder: Path, rgb: Tensor, depth: Tensor, camera: Camera) -> list[Assumption]:
-    """Write ``color.png``, ``depth.png`` and ``intrinsic.json`` of one frame; note pixels that are too far for 16 bits.
-
-    ``rgb``: (3, H, W) in [0, 1]. ``depth``: (1, H, W) in metres, NaN in holes.
-    """
+    """Write ``color.png``, ``depth.png`` and ``intrinsic.json``; note pixels that are too far for 16 bits."""
     millimetres, lost = to_millimetres(depth[0].cpu().numpy())
     write_png(folder / RGBD[0], np.ascontiguousarray(as_bytes(rgb).transpose(1, 2, 0)[..., ::-1]))
     write_png(folder / RGBD[1], millimetres)
@@ -124,7 +94,6 @@ def write_open3d(folder: Path, frames: Sequence[Frame]) -> list[Path]:
 
 
 def _write_intrinsics(path: Path, camera: Camera) -> None:
-    """Write Open3D's JSON of a camera."""
     matrix = [camera.fx, 0.0, 0.0, 0.0, camera.fy, 0.0, camera.cx, camera.cy, 1.0]
     entries = {"width": camera.width, "height": camera.height, "intrinsic_matrix": matrix}
     write_text(path, json.dumps(entries, indent=2) + "\n")
@@ -140,7 +109,6 @@ def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
     millimetres by default; ``depth_unit_scale_factor`` states it for other readers. dn-splatter finds normals by their
     folder, in the colours of :func:`dsr.io.exports.write_normals` (dn_splatter/data/dn_dataset.py, ``omnidata``).
     """
-    expect_poses("nerfstudio", {frame.name: frame.pose is not None for frame in frames})
     camera, folder = _common([frame.camera for frame in frames]), path.parent / "nerfstudio"
     points, (sampled, _) = folder / "points.ply", sample_points(frames)
     up = world_comment(_common([frame.up for frame in frames]) or "")
@@ -171,7 +139,6 @@ def write_transforms(path: Path, frames: Sequence[Frame]) -> list[Path]:
 
 
 def _intrinsics(camera: Camera) -> dict[str, float]:
-    """Return the camera's entries."""
     return {
         "w": camera.width,
         "h": camera.height,
@@ -193,7 +160,6 @@ def write_splatting(folder: Path, frames: Sequence[Frame]) -> list[Path]:
     authors does, with ``--alpha_masks masks`` (its scene/cameras.py). The scene is COLMAP's binary model, which both
     look for first; a single frame without a pose has none.
     """
-    expect_poses("gaussian", {frame.name: frame.pose is not None for frame in frames})
     nearest = min(float(np.fmin.reduce(frame.read_depth(), axis=None, initial=np.inf)) for frame in frames)
     if not np.isfinite(nearest):
         raise ValueError("gaussian: expected some depth, got holes alone")
@@ -224,8 +190,7 @@ def write_rerun(path: Path, frames: Sequence[Frame]) -> list[Path]:
     They are on the timeline ``frame``, by number, and on ``time`` if all frames have one. Cameras have the axes RDF;
     the world's are known as far as it is known which one points up. The library is the extra ``rerun``.
     """
-    with refusing(f"rerun: expected the library rerun-sdk; {how_to_install('rerun')}", ImportError):
-        rerun = importlib.import_module("rerun")
+    rerun = importlib.import_module("rerun")
     recording = rerun.RecordingStream("dsr")
     with replacing(path) as temporary:
         recording.save(str(temporary))

@@ -177,8 +177,6 @@ def _matrix_of_json(path: Path, text: str) -> list[list[float]]:
 
 def check_pose(source: str, matrix: np.ndarray, *, opengl: bool = False) -> np.ndarray:
     """Return a rigid transform (4, 4) from camera to world; ``opengl``: the camera's axes are x right, y up."""
-    if matrix.shape != (4, 4):
-        raise ValueError(f"{source}: expected a matrix of 4 x 4 numbers, got {' x '.join(map(str, matrix.shape))}")
     as_rigid(matrix, source)
     return matrix @ ARKIT_TO_DSR if opengl else matrix
 
@@ -211,11 +209,7 @@ def describe_capture(app: str, unit: str, pairs: Sequence[Pair], *, poses: bool)
 
 
 def add_trajectory(folder: Path, found: PairingResult) -> PairingResult:
-    """Return the pairs of a folder with the poses of Open3D's trajectory, if it fits.
-
-    It has a line of three whole numbers, the first of which orders the poses, and the four rows of each pose
-    (http://redwood-data.org/indoor/fileformat.html).
-    """
+    """Return the pairs of a folder with the poses of Open3D's trajectory (redwood-data.org/indoor/fileformat.html)."""
     path = next((folder / name for name in _OPEN3D_FILES if (folder / name).is_file()), None)
     if path is None or not found.pairs:
         return found
@@ -225,9 +219,8 @@ def add_trajectory(folder: Path, found: PairingResult) -> PairingResult:
             raise ValueError
         order = order_of([int(line.split()[0]) for line in lines[::5]])
     except ValueError:
-        raise ValueError(
-            f"{path}: expected a line of three whole numbers and four of a matrix for each pose, got {len(lines)} lines"
-        ) from None
+        expected = "a line of three whole numbers and four of a matrix for each pose"
+        raise ValueError(f"{path}: expected {expected}, got {len(lines)} lines") from None
     if found.unpaired or len(order) != len(found.pairs):
         text = f"no poses: {path.name} has {len(order)}, for {len(found.pairs)} pairs"
         text += f" and {len(found.unpaired)} pictures without a partner" if found.unpaired else ""
@@ -242,7 +235,6 @@ def add_trajectory(folder: Path, found: PairingResult) -> PairingResult:
 
 
 def _geometry_of_log(place: str, rows: tuple[str, ...]) -> Geometry:
-    """Return the pose of a frame; its camera is read from the file beside the pictures."""
     values = [numbers_in(row.split()) for row in rows]
     if [len(row) for row in values] != [4] * 4:
         raise ValueError(f"{place}: expected a matrix of 4 x 4 numbers, got {' '.join(rows)!r:.80}")

@@ -77,8 +77,6 @@ def interpret(
 
 
 class _Map(NamedTuple):
-    """A map and what its values show."""
-
     name: str
     values: np.ndarray
     holes: np.ndarray
@@ -135,7 +133,6 @@ def _interpret_whole(seen: _Map) -> Meaning:
 
 
 def _by_data_set(seen: _Map) -> Meaning | None:
-    """Return the unit of a data set with such a size or camera; None if there is none."""
     height, width = seen.values.shape
     camera = seen.camera
     for known_width, fx, fy, unit, name in _KNOWN_CAMERAS:
@@ -155,7 +152,6 @@ def _by_data_set(seen: _Map) -> Meaning | None:
 
 
 def _by_steps(seen: _Map) -> Meaning | None:
-    """Return the unit of millimetres that are stored more finely than they are; None where they are near then."""
     for step, name, unit in ((5, "1/5000", 1 / 5000), (10, "0.0001", 1e-4)):
         if not _multiples(seen.known, step):
             continue
@@ -174,7 +170,6 @@ def _whole(seen: _Map, label: str, unit: float, why: str) -> Assumption:
 
 
 def _by_median(seen: _Map) -> Meaning:
-    """Return the unit of whole numbers that makes their median a distance."""
     middle = seen.middle
     if _MIN_MEDIAN <= middle * 1e-3 <= _MAX_MEDIAN:
         others = "TUM RGB-D and ICL-NUIM store 1/5000 m"
@@ -255,7 +250,6 @@ def _expect_one_reading(seen: _Map) -> None:
 
 
 def _interpret_falling(seen: _Map) -> Meaning | None:
-    """Return what values that fall with distance are; None if they do not."""
     if seen.votes.verdict != "falls":
         return None
     votes = seen.votes

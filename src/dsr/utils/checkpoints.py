@@ -99,10 +99,7 @@ def _error(trainer: lightning.Trainer, what: str, ago: int = 0) -> DivergenceErr
 
 
 class BestCheckpoint(ModelCheckpoint):
-    """Keeps ``best.ckpt``, of the lowest score; the first validation is that of the weights before the first step.
-
-    A run goes on wherever it has been moved to.
-    """
+    """Keeps ``best.ckpt``, of the lowest score; the first validation is that of the weights before the first step."""
 
     def __init__(self, folder: Path, monitor: str) -> None:
         super().__init__(folder, "best", monitor=monitor, enable_version_counter=False, save_on_train_epoch_end=False)
@@ -166,7 +163,6 @@ class Interruption(Checkpoint):
     on_exception = teardown  # after which Lightning does not call ``teardown``
 
     def _act(self, trainer: lightning.Trainer, *, due: bool) -> None:
-        """Save if it is time or if any process was asked to end, and in that case end."""
         agree = trainer.strategy.reduce_boolean_decision
         ends = agree(bool(self.signals), all=False)
         if (ends or agree(due, all=False)) and not trainer.fast_dev_run:  # type: ignore[attr-defined]
@@ -233,10 +229,7 @@ class ScoreTables(Callback):
 
 
 class StepProgress(Callback):
-    """Shows the steps of a training with the latest loss, the scenes of a validation, and its scores.
-
-    Lines about validations begin with the ``subject``, such as a scene's name.
-    """
+    """Shows the steps of a training with the latest loss, and validations, in lines that begin with a ``subject``."""
 
     def __init__(self, progress: Progress, name: str, subject: str = "") -> None:
         self._progress, self._name, self._subject = progress, name, f"{subject}: " if subject else ""

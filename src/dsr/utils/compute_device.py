@@ -101,7 +101,5 @@ def pick_device(name: str, fast_on: str = "any", precision: str = "float32") -> 
         torch.backends.cudnn.allow_tf32 = precision == "tf32"
         torch.backends.cuda.matmul.allow_tf32 = False  # maps are enlarged and averaged by products of matrices
     elif precision == "tf32":
-        raise ConfigError(
-            f"precision: expected auto, float32 or bfloat16 on device={device}, got tf32, which GPUs have"
-        )
+        raise ConfigError(f"precision: expected auto, float32 or bfloat16 on device={device}, got tf32")
     return device

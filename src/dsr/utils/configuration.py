@@ -102,7 +102,6 @@ def _is_node(value: Any) -> bool:
 
 
 def _built(key: str, value: Any) -> Any:
-    """Return a value with the nodes in it built."""
     if not _is_node(value):
         return value
     if isinstance(value, list):

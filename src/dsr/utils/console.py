@@ -1,7 +1,6 @@
 """Exit codes, the console and the progress display of all commands."""
 
 import contextlib
-import errno
 import functools
 import io
 import sys
@@ -18,7 +17,6 @@ from rich.text import Text
 from dsr.utils.progress import Item, Progress, Task, Unit, clock, megabytes
 
 USAGE_ERROR = 2
-_OUTPUT = {errno.ENOSPC, errno.EPIPE}  # errors without a file's name that are those of printing
 _LONGEST = 1000  # characters of an error's line
 _TURNING = "\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"  # characters that turn the direction of text
 _LOG_WIDTH = 110  # columns where the output is not a terminal
@@ -27,12 +25,9 @@ _MANY, _LONG = 50, 2.0  # of more items only those get a line that take so many 
 
 
 def open_console() -> Console:
-    """Return a console on stdout, wide enough for tables if that is not a terminal.
-
-    What stdout cannot encode, such as the name of a file that is no text, is shown with escapes.
-    """
+    """Return a console on stdout, wide enough for tables if that is not a terminal."""
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")
+        sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be no text
     console = Console()
     return console if console.is_terminal else Console(width=_LOG_WIDTH)
 
@@ -71,17 +66,11 @@ def printable(text: str) -> str:
 
 def one_line(error: BaseException) -> str:
     """Return an error's message on one line."""
-    if isinstance(error, OSError) and error.filename is None and error.errno in _OUTPUT:
-        return f"standard output: expected to be writable, got: {error.strerror}"
     return shorten(printable(" ".join(str(error).split()))) or type(error).__name__
 
 
 class ConsoleProgress(Progress):
-    """Shows progress with named times: bars on a terminal, elsewhere plain lines.
-
-    If the output is not a terminal, each finished item gets a line, and running work gets one every ten seconds.
-    ``now`` returns the time in seconds.
-    """
+    """Shows progress: bars on a terminal, elsewhere lines, of finished items, and of running work every ten seconds."""
 
     def __init__(self, console: Console, now: Callable[[], float] = time.monotonic) -> None:
         self._console, self._now, self._next_line = console, now, 0.0

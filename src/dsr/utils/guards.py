@@ -130,10 +130,7 @@ def files_in(packed: zipfile.ZipFile, archive: object) -> list[zipfile.ZipInfo]:
 
 
 def read_member(packed: zipfile.ZipFile, name: str) -> bytes:
-    """Return a member of an archive, in no more memory than the size that it declares, which the caller checks.
-
-    A member that unpacks to more, of which :meth:`zipfile.ZipFile.read` would unpack all, is damaged.
-    """
+    """Return a member of an archive, in no more memory than it declares, which callers check; more is damage."""
     declared = packed.getinfo(name).file_size
     with packed.open(name) as member:
         content = member.read(declared)
@@ -288,11 +285,7 @@ def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
 
 
 def did_you_mean(given: object, known: Iterable[str]) -> str:
-    """Return ``; did you mean NAME?`` to end a message, or an empty text where no known name is like the given one.
-
-    That is the only name with all words of the given one, such as ``--depth-unit`` for ``--unit``, or else the name of
-    the most similar letters.
-    """
+    """Return ``; did you mean NAME?`` for the only name with all words of the given one, else a similar one."""
     names = {name.lower(): name for name in known}
     words = {name: {word.rstrip("s") for word in re.findall(r"[^\W_]+", name)} for name in (*names, str(given).lower())}
     asked = words[str(given).lower()]
@@ -331,10 +324,7 @@ def path_within(folder: Path, name: str, source: object, form: str = "{}") -> Pa
 
 
 def natural_key(name: str | PurePath) -> tuple[tuple[str | tuple[int, str], ...], str]:
-    """Return a key that sorts names, or paths folder by folder, with the numbers in them by value: 2 before 10.
-
-    It has texts and numbers in turns, numbers as how many digits they have and the digits, ``/`` as -1; and the name.
-    """
+    """Return a key that sorts names, or paths folder by folder, with the numbers in them by value: 2 before 10."""
     text = str(name).replace(os.sep, "/")
     parts: list[str | tuple[int, str]] = list(_TURNS.split(text))
     for place in range(1, len(parts), 2):

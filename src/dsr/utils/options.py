@@ -135,7 +135,6 @@ def _options_of(record: type) -> Iterator[_Option]:
 
 
 def _with_those_of_groups(record: type) -> list[_Option]:
-    """Return the options of a record, then those of its groups, without the groups."""
     own = list(_options_of(record))
     inner = [_with_those_of_groups(each.kind) for each in own if each.group]
     return sum(inner, [each for each in own if not each.group])
@@ -146,7 +145,6 @@ class Options:
     """A record of options, which checks its values; dataclasses of options derive from it."""
 
     def __post_init__(self) -> None:
-        """Raise OptionError for a value that is not as expected."""
         for each in _options_of(type(self)):
             value = getattr(self, each.name)
             if value is None or each.group:
@@ -161,10 +159,7 @@ Record = TypeVar("Record", bound=Options)
 
 
 def add_options(place: Any, record: type[Options], *, needed: bool = True) -> None:
-    """Add the options of a record, which are required only if it is ``needed``, to a parser or a group of it.
-
-    An option that isn't given is absent from the namespace.
-    """
+    """Add a record's options, required only if ``needed``, to a parser or a group; the namespace lacks others."""
     excluding: dict[str, Any] = defaultdict(place.add_mutually_exclusive_group)
     for each in _options_of(record):
         if each.group:

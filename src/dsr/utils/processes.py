@@ -40,11 +40,7 @@ class InUseError(ValueError):
 
 @contextlib.contextmanager
 def at_work(folder: Path, settings: str) -> Iterator[None]:
-    """Within this context a directory, which is made if need be, belongs to commands with the same settings.
-
-    The last command that leaves removes the locks, and the directory if it was made for them and is empty. If a command
-    with other settings is at work there, this is an InUseError.
-    """
+    """Within this context a directory belongs to commands with the same settings; InUseError for others."""
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     place = folder / LOCKS
     beginning = f"command-{_digest(settings)}-"
@@ -131,7 +127,6 @@ class Pool:
         self._executors: list[ProcessPoolExecutor] = []
 
     def __enter__(self) -> Self:
-        """Return itself."""
         self._others = set(multiprocessing.active_children())
         self._executors.append(self._new_executor())
         return self
@@ -151,10 +146,7 @@ class Pool:
     def results(
         self, function: Callable[..., _Value], items: Sequence[_Item], *, ordered: bool = False
     ) -> Generator[tuple[_Item, _Value]]:
-        """Begin to work on items, and return each with its value, as they come or in their order.
-
-        What a killed worker has left is begun again. If workers are killed twice, a ChildProcessError is raised.
-        """
+        """Begin to work on items; yield each with its value as they come, or ``ordered``. ChildProcessError ends it."""
         left, executor = self._submit(function, items)
 
         def values() -> Generator[tuple[_Item, _Value]]:

@@ -41,10 +41,8 @@ class Progress:
     ) -> Iterator[Item]:
         """Yield items, and show how many are done.
 
-        Args:
-            total: number of items, those included that are ``done`` already; None where ``items`` can be counted.
-            lines: whether each item gets a line if the output is not a terminal; False if the caller prints one.
-
+        ``total``: of the items, those included that are ``done`` already; None where they can be counted. ``lines``:
+        whether each item gets a line if the output is not a terminal; False if the caller prints one.
         """
         yield from items
 
@@ -104,17 +102,7 @@ def megabytes(size: float) -> str:
 
 
 def show_length(metres: float, digits: int = 3) -> str:
-    """Return a length in the unit that suits its size.
-
-    Args:
-        metres: 0 or more.
-        digits: significant ones.
-
-    Example:
-        >>> [show_length(each) for each in (12000.0, 2.5, 0.0083, 4e-5)]
-        ['12 km', '2.5 m', '8.3 mm', '0.04 mm']
-
-    """
+    """Return a length with significant digits in the unit that suits its size: 12 km, 2.5 m, 8.3 mm, 0.04 mm."""
     metres = float(f"{metres:.{digits}g}")  # so that the unit is that of what is shown
     value, unit = (metres / 1e3, "km") if metres >= 1e3 else (metres, "m") if metres >= 0.1 else (metres * 1e3, "mm")
     return f"{value:.9g} {unit}"

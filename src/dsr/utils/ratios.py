@@ -38,7 +38,5 @@ def match_ratio(scale: float | str, measured: Collection[float]) -> float:
         return next(iter(measured))
     nearest = min(measured, key=lambda ratio: abs(ratio - scale), default=None)
     if nearest is None or not abs(nearest - scale) <= _TOLERANCE * scale:
-        raise ValueError(
-            f"downsampling=measured expects a low-resolution map at x{round_ratio(scale)}, the scene has {have}"
-        )
+        raise ValueError(f"downsampling=measured expects a map at x{round_ratio(scale)}, the scene has {have}")
     return nearest

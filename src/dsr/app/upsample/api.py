@@ -180,12 +180,7 @@ class Upsampler:
         progress: Steps | None = None,
         steady: Steady | None = None,
     ) -> Surface[Array]:
-        """Upsample a depth map; the arguments are those of :func:`upsample`, for one picture, and of :meth:`stream`.
-
-        Raises:
-            ValueError: as there.
-
-        """
+        """Upsample a depth map; the arguments are those of :func:`upsample`, for one picture, and of :meth:`stream`."""
         with python_messages():
             picture, device = _read(rgb, depth, camera, mask=mask, unit=unit)
             return self._upsample(picture, device, progress=progress, steady=steady)

@@ -102,9 +102,7 @@ def _metres(stored: np.ndarray, unit: str | float | None, camera: Camera) -> tup
         raise ValueError(f"depth: expected floats, or whole numbers of 16 bits or more, got {kind}")
     if factor is None:
         if stored.dtype.kind != "f":
-            raise ValueError(
-                f"depth: expected floats in metres, or whole numbers with unit='mm', 'm' or 0.0002, got {kind}"
-            )
+            raise ValueError(f"depth: expected floats in metres, or whole numbers with unit='mm' or such, got {kind}")
         holes, mark, usual = ~(np.isfinite(stored) & (stored > 0)), math.nan, "NaN"
     else:
         stored = turn_back_bits("depth", stored, SUNRGBD_BITS) if factor == "sunrgbd" else stored

@@ -77,11 +77,7 @@ def _search(choice: FrameChoice, output: Path) -> PairingResult:
 
 
 class FrameSequence:
-    """The frames of each folder of depth maps in order, with the poses of a file, or those that the frames have.
-
-    Up to ``neighbours`` other frames vote on each one's depth. A file that is damaged, or does not fit, is a
-    ValueError.
-    """
+    """The frames of each folder in order, with their poses or those of a file; neighbours vote on their depth."""
 
     def __init__(
         self, pairs: Sequence[Pair], read: Callable[[Pair], Picture], neighbours: int, poses: Path | None

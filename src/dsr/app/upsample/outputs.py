@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from dsr.app.upsample.parts import ERRORS, FILES, METRES, PARTS, Results
-from dsr.app.upsample.stored import INFO, read_depth, read_errors, read_info
+from dsr.app.upsample.stored import INFO, read_depth, read_info
 from dsr.geometry.camera import Camera
 from dsr.geometry.mesh import ERROR_SHARE, FLATNESS
 from dsr.inference.resizing import Plan
@@ -34,6 +34,7 @@ from dsr.io.exports import (
 )
 from dsr.io.inputs import Picture
 from dsr.io.photos import write_png
+from dsr.io.posed_frames import read_errors
 from dsr.io.scene_files import write_rgbd
 from dsr.methods.base import Surface
 from dsr.notes import CHECKS, Assumption
@@ -159,7 +160,8 @@ class ResultFolder:
         try:
             surface = Surface(torch.from_numpy(read_depth(self.path, camera))[None])
             if errors or (self.path / ERRORS).is_file():
-                depth_error, angle_error = (torch.from_numpy(each)[None] for each in read_errors(self.path, camera))
+                stored = read_errors(self.path / ERRORS, camera)
+                depth_error, angle_error = (torch.from_numpy(each)[None] for each in stored)
                 surface = surface._replace(depth_error=depth_error, angle_error=angle_error)
         except (OSError, ValueError):
             return None
@@ -181,14 +183,9 @@ class ResultFolder:
         with ThreadPoolExecutor(1) as beside:  # shapes take as long as all the rest
             shapes = beside.submit(_write_shapes, self.path, result)
             written = _write_maps(self.path, result) | shapes.result()
-        files: dict[str, None] = {}  # each once, as the notes
-        facts: dict[Assumption, None] = {}
-        counts: dict[str, dict[str, Any]] = {}
-        for name, output in written.items():
-            files |= dict.fromkeys(output.files)
-            facts |= dict.fromkeys(output.notes)
-            if output.shape is not None:
-                counts[name] = output.shape._asdict()
+        files = dict.fromkeys(name for output in written.values() for name in output.files)  # each once
+        facts = dict.fromkeys(note for output in written.values() for note in output.notes)
+        counts = {name: output.shape._asdict() for name, output in written.items() if output.shape is not None}
         others = [name for name in kept.get("files", ()) if name not in files]
         notes = (*picture.assumptions, *facts)
         known = ("warning: ", *(note.text for note in notes))
@@ -209,10 +206,7 @@ class ResultFolder:
                 "noise": surface.noise._asdict() if surface.noise else kept.get("noise"),
                 **_described(picture, result.encoding),
                 **counts,
-                "shares": {
-                    **kept.get("shares", {}),
-                    **{name: round(share, 6) for name, share in result.shares.items()},
-                },
+                "shares": kept.get("shares", {}) | {name: round(share, 6) for name, share in result.shares.items()},
                 "assumptions": [*map(str, notes), *said],
                 "checks": CHECKS,
                 "warnings": [note.record() for note in notes if note.code],
@@ -229,7 +223,6 @@ class ResultFolder:
 
 
 def _described(picture: Picture, encoding: Encoding) -> dict[str, Any]:
-    """Return the sizes, the camera with its pose, and the files' encodings for ``info.json``."""
     encodings = {"input_depth": picture.encoding, "depth_file": encoding, "depth_metres": IN_METRES}
     plain = {name: asdict(each) for name, each in encodings.items()}
     for entries in plain.values():
@@ -355,6 +348,5 @@ def _write_shapes(folder: Path, result: Result) -> dict[str, Output]:
 
 
 def _fewer(part: str, what: str, option: str, shape: Written) -> list[Assumption]:
-    """Return a note on a shape that a limit has made smaller."""
     text = f"the {part} has fewer {what} than the depth map gives ({option})"
     return [Assumption(text, str(shape))] if shape.how not in ("", FLAT) else []

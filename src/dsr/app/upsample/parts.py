@@ -30,7 +30,7 @@ class Part(NamedTuple):
     shape: bool = False  # whether it takes as long as all the rest, and is written beside it
     errors: bool = False  # whether it depends on the expected errors
     poses: bool = False  # whether it needs a pose of each frame, where there are several
-    library: tuple[str, str, str] | None = None  # module that it needs, its package, and the extra that installs it
+    library: str = ""  # module that it needs, and the extra that installs it
 
 
 # by their names, in the order in which they are listed
@@ -54,8 +54,7 @@ PARTS: dict[str, Part] = {
         Part("nerfstudio", ("transforms.json", "nerfstudio", "normals_from_pretrain"), of_all=True, usual=False,
              poses=True),
         Part("gaussian", ("gaussian",), of_all=True, usual=False, poses=True),
-        Part("rerun", ("scene.rrd",), of_all=True, usual=False,
-             library=("rerun", "rerun-sdk", "rerun")),
+        Part("rerun", ("scene.rrd",), of_all=True, usual=False, library="rerun"),
     )
 }  # fmt: skip
 _MORE = tuple(part.name for part in PARTS.values() if not part.usual)
@@ -122,14 +121,13 @@ class Results(Options):
     dry_run: bool = option(False, "say what would be done and assumed", recorded=False)
 
     def __post_init__(self) -> None:
-        """Check the values, and that there is something to write."""
         super().__post_init__()
         if not self.names:
             raise ValueError("--only, --without: expected something to be left to write, got nothing")
         for part in self.of_all:
-            if part.library is not None and importlib.util.find_spec(part.library[0]) is None:
-                _, package, extra = part.library
-                raise ValueError(f"--with {part.name}: expected the library {package}; {how_to_install(extra)}")
+            if part.library and importlib.util.find_spec(part.library) is None:
+                cure = how_to_install(part.library)
+                raise ValueError(f"--with {part.name}: expected the library {part.library}; {cure}")
 
     @functools.cached_property
     def names(self) -> tuple[str, ...]:

@@ -77,7 +77,6 @@ class FrameChoice(Options):
     )
 
     def __post_init__(self) -> None:
-        """Check the values, and that the files fit together."""
         super().__post_init__()
         if bool(self.folders) == bool(self.rgb or self.depth) or bool(self.rgb) != bool(self.depth):
             raise ValueError("expected --rgb and --depth, or folders that hold both")
@@ -152,7 +151,6 @@ class Upsampling(Options):
     )
 
     def __post_init__(self) -> None:
-        """Check the values, and that there is such a method."""
         super().__post_init__()
         check_method(self.method, self.directories)
         for name, value in self.settings:
@@ -219,7 +217,6 @@ class UpsampleRequest(Options):
     results: Results = group(Results, "what is written")
 
     def __post_init__(self) -> None:
-        """Check what depends on several options, then what takes seconds to check."""
         if self.frames.confidence and self.reading.min_confidence is None:
             expected = "expected --min-confidence with it, the fraction below which pixels are holes"
             raise OptionError("confidence", expected)

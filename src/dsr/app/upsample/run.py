@@ -26,7 +26,6 @@ from dsr.inference.steady import KEPT, Steady
 from dsr.io.images import pixels_in_header
 from dsr.io.inputs import Picture, read_geometry, read_picture
 from dsr.io.pairs import Pair
-from dsr.io.scene_files import expect_poses
 from dsr.io.trajectories import USUAL_SIZE, read_poses
 from dsr.methods.base import MapNoise, Surface
 from dsr.methods.glass import NOTED
@@ -94,7 +93,6 @@ def run(request: UpsampleRequest, console: Console) -> list[str]:
 
 
 def _run(request: UpsampleRequest, frames: Frames, console: Console) -> list[str]:
-    """Upsample frames in a folder of this command's own, and return the problems."""
     wanted, shard, pairs = request.results, request.frames.shard, frames.found.pairs
     started = time.monotonic()
     written = [*(name for part in wanted.of_all for name in part.files), EXPORTS]
@@ -170,7 +168,6 @@ def work_through(request: UpsampleRequest, frames: Frames, tell: Tell, progress:
 
 
 def _begin(request: UpsampleRequest, frames: Frames) -> FrameWork:
-    """Prepare a worker, which reads frames again only for their neighbours."""
     return FrameWork(request, frames, kept=_KEPT if request.frames.neighbours else 0)
 
 
@@ -194,14 +191,17 @@ def _check_poses(request: UpsampleRequest, frames: Frames, console: Console) -> 
             with contextlib.suppress(ValueError, OSError):  # it is reported as a frame of its own
                 geometry, _ = read_geometry(pair, pixels_in_header(pair.rgb) or USUAL_SIZE, request.reading)
                 posed[pair.name] = geometry.pose is not None
+    missing = [name for name, has in posed.items() if not has]
     for part in parts:
-        expect_poses(part.name, posed)
-        if not all(posed.values()):  # a single one
+        if missing and len(posed) > 1:
+            count = f"{len(missing)} of {len(posed)}"
+            text = f"expected a pose of each frame, got none for {count}, such as {missing[0]}; --poses gives them"
+            raise ValueError(f"{part.name}: {text}")
+        if missing:
             show(console, f"--with {part.name}: the frame has no pose{_UNPOSED[part.name]}")
 
 
 def _show_found(request: UpsampleRequest, frames: Frames, console: Console) -> None:
-    """Show what was found, which files have no partner, and which frames a shard works on."""
     found, total, shard = frames.found, len(frames.whole), request.frames.shard
     named = total == 1 and len(found.pairs) == 1
     lines = [f"{found.pairs[0].rgb} and {found.pairs[0].depth}" if named else f"{total} pairs of photo and depth map"]
@@ -222,7 +222,6 @@ def _show_found(request: UpsampleRequest, frames: Frames, console: Console) -> N
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Return the first names, and how many more there are."""
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return ", ".join(names[:_SHOWN]) + more
 
@@ -322,7 +321,6 @@ class FrameWork:
         return self._steady
 
     def _folder(self, pair: Pair, target: Path) -> ResultFolder:
-        """Return the folder of a frame's results, with what these depend on."""
         request = self._request
         inputs = inputs_with_neighbours(request, pair, self._sequence.neighbours(pair))
         return ResultFolder(target, inputs, request.settings, request.results, strict=request.reading.strict)
@@ -346,7 +344,6 @@ class FrameWork:
 
 
 def _describe(surface: Surface, how: Upsampling) -> list[Assumption]:
-    """Return notes on an estimated noise of the input, on outliers, on what looks like glass, and on wide holes."""
     notes, noise = [], surface.noise
     if noise is not None and "noise" not in how.arguments:
         text = f"about {show_length(noise.deviation, 2)}"
@@ -369,7 +366,6 @@ def _describe(surface: Surface, how: Upsampling) -> list[Assumption]:
 
 
 def _in_brief(noise: MapNoise | None, shares: Mapping[str, float]) -> list[str]:
-    """Return the noise of the input, the size that it was worked on at, and the shares of the pixels that are not 0."""
     brief = []
     if noise is not None:
         brief.append(f"noise {show_length(noise.deviation, 2)}")

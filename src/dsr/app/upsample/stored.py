@@ -13,16 +13,15 @@ import numpy as np
 import torch
 
 from dsr.app.upsample.parts import ERRORS, METRES, Part, Results
-from dsr.evaluation.results import load_errors
 from dsr.geometry.camera import Camera
+from dsr.geometry.poses import as_rigid
 from dsr.inference.plausibility import find_filled
 from dsr.io.depth_files import read_depth_file
 from dsr.io.exports import INPUT, read_input
 from dsr.io.frames import UPS
+from dsr.io.posed_frames import Frame, read_errors
 from dsr.io.scene_files import (
     RGBD,
-    Frame,
-    parse_pose,
     write_open3d,
     write_rerun,
     write_splatting,
@@ -30,9 +29,8 @@ from dsr.io.scene_files import (
 )
 from dsr.notes import Assumption, read_warning
 from dsr.sample import expect_distances
-from dsr.utils.arrays import array_headers
 from dsr.utils.files import write_text
-from dsr.utils.guards import TooLargeError, is_number, natural_key, parse_json, path_within, pixels_beside, read_limited
+from dsr.utils.guards import is_number, natural_key, parse_json, path_within, pixels_beside, read_limited, refusing
 from dsr.utils.progress import show_length
 
 if TYPE_CHECKING:
@@ -49,6 +47,7 @@ _OPTIONAL: Mapping[str, Any] = {  # entries that ``info.json`` may lack, as whil
     "photo_size": [],
     "input_size": [],
 }
+_FOREIGN = "{}: expected a file of `dsr upsample`, got something else"
 _DEEPEST = 6  # folders below the given one in which results are looked for
 
 
@@ -76,7 +75,7 @@ def read_result(folder: Path, name: str) -> ViewedResult:
     depth, notes = read_depth(folder, camera), list(info["assumptions"])
     depth_error = angle_error = None
     if (folder / ERRORS).is_file():
-        depth_error, angle_error = read_errors(folder, camera)
+        depth_error, angle_error = read_errors(folder / ERRORS, camera)
     photo = depth_lr = filled = None
     try:
         photo, depth_lr = read_input(folder / INPUT)
@@ -112,7 +111,7 @@ def read_info(folder: Path) -> dict[str, Any] | None:
     path = folder / INFO
     if not path.is_file():
         return None
-    try:
+    with refusing(_FOREIGN.format(path), ValueError, KeyError, TypeError, AttributeError):
         info = {**_OPTIONAL, **parse_json(read_limited(path), finite=False)}
         lists = [info[name] for name in ("files", "assumptions", "warnings", "photo_size", "input_size")]
         records = [info[name] for name in ("inputs", "settings", "shares", "seconds")]
@@ -126,8 +125,6 @@ def read_info(folder: Path) -> dict[str, Any] | None:
         warnings_of(info)
         up = info.get("up")
         return {**info, "complete": info["complete"] is True, "up": up if up in UPS else ""}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else") from error
 
 
 def warnings_of(info: Mapping[str, Any]) -> tuple[Assumption, ...]:
@@ -159,17 +156,10 @@ def read_depth(folder: Path, camera: Camera) -> np.ndarray:
     path, size = folder / METRES, (camera.height, camera.width)
     if not path.is_file():
         raise ValueError(f"{folder}: expected a result with depth, got one without {METRES}; run it with --only depth")
-    try:
-        stored = read_depth_file(path, pixels_beside(*size))
-    except TooLargeError:
-        raise
-    except (ValueError, OSError) as error:
-        raise ValueError(f"{path}: expected a map of depths, got a damaged or foreign file") from error
+    stored = read_depth_file(path, pixels_beside(*size))
     if stored.shape != size or stored.dtype != np.float32:
         text = f"{stored.dtype} of shape {stored.shape}"
         raise ValueError(f"{path}: expected float32 of shape {size}, the photo's, got {text}")
-    if min(size) < 2:
-        raise ValueError(f"{path}: expected a map of at least 2 x 2 pixels, got {size}")
     depth = np.where(np.isfinite(stored) & (stored > 0), stored, np.float32(math.nan))
     if not np.isfinite(depth).any():
         raise ValueError(f"{path}: expected depths, all pixels are holes")
@@ -177,31 +167,16 @@ def read_depth(folder: Path, camera: Camera) -> np.ndarray:
     return depth
 
 
-def read_errors(folder: Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return the expected errors of depth and normal of a result, (H, W) float32 each, in metres and degrees.
-
-    A damaged or foreign file is a ValueError, a missing one an OSError.
-    """
-    path = folder / ERRORS
-    size = (camera.height, camera.width)
-    shapes = {name: shape for name, (shape, _) in array_headers(path).items()}
-    fits = all(shapes.get(name) == size for name in ("depth_error", "angle_error"))
-    errors = load_errors(path) if fits else None
-    if errors is None:
-        raise ValueError(f"{path}: expected depth_error and angle_error of shape {size}, the photo's, got {shapes}")
-    return errors[0][0].numpy(), errors[1][0].numpy()
-
-
 def read_frame(name: str, folder: Path) -> Frame:
-    """Return the frame whose results are in a folder; a ValueError if they are not complete.
-
-    Its pose is the entry ``pose`` of ``info.json``: a camera-to-world matrix of four lists of four numbers, in metres.
-    """
+    """Return the frame whose results are in a folder; a ValueError if they are not complete."""
     info = read_complete(folder)
     depth, colour = folder / METRES, folder / "rgbd" / RGBD[0]
     if not (depth.is_file() and colour.is_file()):
         raise ValueError(f"{folder}: expected {METRES} and rgbd/{RGBD[0]} of this run, one is missing")
-    pose, time = parse_pose(f"{folder / INFO}: pose", info.get("pose")), info.get("time")
+    pose, time = info.get("pose"), info.get("time")
+    if pose is not None:
+        as_rigid(pose, f"{folder / INFO}: pose")
+        pose = np.vstack((np.array(pose, np.float64)[:3], (0, 0, 0, 1)))
     return Frame(
         name, read_camera(folder, info), pose, colour, depth, info["up"], time if is_number(time) else None,
         errors=folder / ERRORS if (folder / ERRORS).is_file() else None, max_error=_max_error(info),
@@ -270,13 +245,11 @@ def read_exports(output: Path) -> dict[str, list[str]]:
     path = output / EXPORTS
     if not path.is_file():
         return {}
-    try:
+    with refusing(_FOREIGN.format(path), ValueError, KeyError, TypeError):
         exports = dict(parse_json(read_limited(path))["exports"])
         lists = [files if isinstance(files, list) else [None] for files in exports.values()]
         if not all(isinstance(file, str) for files in lists for file in files):
             raise TypeError
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: expected a file of `dsr upsample`, got something else") from error
     for name, files in exports.items():
         for file in files:
             path_within(output, file, f"{path}: exports.{name}")

@@ -121,12 +121,7 @@ class Surface(Generic[Array]):
         return self._picture.camera
 
     def normals(self) -> Array:
-        """Return the unit normals, which face the camera, float32, NaN in holes.
-
-        Returns:
-            (H, W, 3) as an array, (3, H, W) as a tensor.
-
-        """
+        """Return the unit normals, which face the camera, NaN in holes: (H, W, 3) float32, or a tensor (3, H, W)."""
         normals = self._normals
         return cast("Array", normals.numpy().transpose(1, 2, 0) if self._device is None else normals.to(self._device))
 
@@ -232,7 +227,6 @@ class Surface(Generic[Array]):
         return f"Surface({size}, {self._range()}, {self._plan.method} x{self._plan.scale})"
 
     def _range(self) -> str:
-        """Return the nearest and the farthest depth."""
         known = self._found.depth[self._found.depth.isfinite()]
         return f"{known.min():.3g} to {known.max():.3g} m" if len(known) else "nothing known"
 
@@ -271,7 +265,6 @@ class Surface(Generic[Array]):
         return depth
 
     def _colours(self, mesh: Mesh) -> np.ndarray:
-        """Return the photo's colours at the vertices, (N, 3) uint8."""
         return as_bytes(self._picture.rgb.flatten(1)[:, torch.from_numpy(mesh.pixels)]).T
 
     def _give(self, values: Tensor | None) -> Array:

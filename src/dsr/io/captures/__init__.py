@@ -230,7 +230,7 @@ CAPTURES = (
         of_file=partial(_call, "jpeg.read"),
         suffixes=(".jpg", ".jpeg"),
         mark=partial(_call, "jpeg.has_depth"),
-        last=True,
+        fallback=True,
     ),
     Capture(
         "COLMAP",
@@ -238,8 +238,7 @@ CAPTURES = (
         "`sparse/0/`, `sparse/`, `colmap/sparse/0/` with `images.bin` or `images.txt`, or these beside the photos",
         "intrinsics; distortion; poses; depth of the maps by its values, without maps of the model's points",
         "written by pycolmap; models of two real scenes",
-        "",
-        "https://colmap.github.io/format.html",
+        source="https://colmap.github.io/format.html",
     ),
     # Layouts of loose pictures, which dsr.io.layouts recognises.
     Capture(
@@ -248,8 +247,7 @@ CAPTURES = (
         "two folders of pictures, and `scene/trajectory.log` or `trajectory.log`",
         "depth by its values, mostly mm; intrinsics (`camera_intrinsic.json`, `intrinsic.json`); poses",
         "written by its format",
-        "",
-        "https://www.open3d.org/docs/release/tutorial/reconstruction_system/system_overview.html",
+        source="https://www.open3d.org/docs/release/tutorial/reconstruction_system/system_overview.html",
         marks=("scene/trajectory.log", "trajectory.log"),
         needs=("color/* or image/* or rgb/*", "depth/*"),
     ),
@@ -270,8 +268,7 @@ CAPTURES = (
         "`*.depth` beside the photos",
         "depth in cm along the ray (text); the data set's intrinsics",
         "a real frame",
-        "",
-        "https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html",
+        source="https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html",
     ),
     Capture(
         "any two folders, or files side by side",
@@ -279,8 +276,6 @@ CAPTURES = (
         "names that say rgb, color, depth ..., else by one channel of 16 bits or floats",
         "depth by its values, intrinsics of a camera file beside them",
         "real frames of seven sensors",
-        "",
-        "",
     ),
 )
 CAPTURE_FILES = (*dict.fromkeys(suffix for each in CAPTURES for suffix in each.suffixes), ".zip")
@@ -296,9 +291,9 @@ def all_captures() -> tuple[Capture, ...]:
     return (*others, *CAPTURES)
 
 
-def find_capture(place: Path, *, last: bool = False) -> PairingResult | None:
-    """Return the frames of a capture, a file or a folder, of those that are asked first or last; None if it is none."""
-    asked = (each for each in all_captures() if each.last == last or place.is_file())
+def find_capture(place: Path, *, fallback: bool = False) -> PairingResult | None:
+    """Return the frames of a capture, a file or a folder; None if it is none. Fallbacks are asked apart."""
+    asked = (each for each in all_captures() if each.fallback == fallback or place.is_file())
     return next((found for each in asked if (found := each.frames(place)) is not None), None)
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, Field, create_model
+from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from dsr.io.captures.contract import has_name
 from dsr.io.frames import HIGHEST_LEVEL, CaptureFrame, ConfidenceMap, Geometry, Size, stated
@@ -77,7 +77,6 @@ def find_arkitscenes(folder: Path) -> PairingResult | None:
 
 
 def _time(stem: str) -> float:
-    """Return the time in a frame's name, NaN if there is none."""
     return next(iter(numbers_in([stem.rpartition("_")[2]])), math.nan)
 
 
@@ -108,20 +107,11 @@ def _arkitscenes_geometry(place: str, intrinsics: Path | None, motion: _Motion |
     return Geometry(camera, check_pose(place, np.linalg.inv(to_camera)), up="z")
 
 
-class _PolycamIntrinsics(BaseModel, strict=True):
-    """The camera in a file of ``cameras``; numbers may be NaN here."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    width: Pixels
-    height: Pixels
-
-
+_INTRINSICS = ("fx", "fy", "cx", "cy")
 _POSE = [[f"t_{row}{column}" for column in range(4)] for row in range(3)]  # names of the numbers of a pose
-_NUMBERS: dict[str, Any] = dict.fromkeys(itertools.chain(*_POSE), (float, ...))
-_PolycamCamera = create_model("_PolycamCamera", __base__=_PolycamIntrinsics, **_NUMBERS)
+_ENTRIES: dict[str, Any] = dict.fromkeys((*_INTRINSICS, *itertools.chain(*_POSE)), (float, ...))  # which may be NaN
+_ENTRIES |= dict.fromkeys(("width", "height"), (Pixels, ...))
+_PolycamCamera = create_model("_PolycamCamera", __config__=ConfigDict(strict=True), **_ENTRIES)
 
 
 def find_polycam(folder: Path) -> PairingResult | None:
@@ -154,9 +144,10 @@ def find_polycam(folder: Path) -> PairingResult | None:
 
 
 def _polycam_geometry(path: Path) -> Geometry:
-    stored = parse_model(_PolycamCamera, read_text(path, _LARGEST_JSON), path, f"expected {_POLYCAM}'s camera; ")
-    camera = intrinsics_camera(str(path), (stored.height, stored.width), (stored.fx, stored.fy, stored.cx, stored.cy))
-    rows = [[getattr(stored, name) for name in names] for names in _POSE]
+    model = parse_model(_PolycamCamera, read_text(path, _LARGEST_JSON), path, f"expected {_POLYCAM}'s camera; ")
+    stored = model.model_dump()
+    numbers, *rows = ([stored[name] for name in names] for names in (_INTRINSICS, *_POSE))
+    camera = intrinsics_camera(str(path), (stored["height"], stored["width"]), numbers)
     pose = check_pose(str(path), np.array([*rows, [0, 0, 0, 1]], dtype=np.float64), opengl=True)
     return Geometry(camera, pose, up="y")
 

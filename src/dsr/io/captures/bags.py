@@ -59,7 +59,6 @@ def images_of(reader: Any, path: Path, topic: str) -> Iterator[Message]:
 
 
 def _fetch(path: Path, topic: str, time: int, order: int) -> bytes:
-    """Return the bytes of the message of a topic with a number among those of a time."""
     with naming_recording(path):
         reader = open_recording(path)
         return bytes(list(reader.messages(connections_of(reader, topic), start=time, stop=time + 1))[order][2])

@@ -78,8 +78,6 @@ _BY_NAME = {model.name: model for model in _MODELS.values()}
 
 
 class _Camera(NamedTuple):
-    """A camera as it is stored."""
-
     model: _Model
     width: int
     height: int
@@ -242,7 +240,6 @@ def _geometry(place: str, quaternion: Sequence[float], translation: Sequence[flo
 
 
 def _pose(place: str, quaternion: Sequence[float], translation: Sequence[float]) -> np.ndarray:
-    """Return the transform from world to camera, (4, 4)."""
     w, *xyz = quaternion
     return from_quaternion(translation, (*xyz, w), place)
 
@@ -391,7 +388,6 @@ def add_transforms(folder: Path, found: PairingResult) -> PairingResult | None:
 
 
 def _transform(place: str, view: dict[str, Any], size: tuple[int, int]) -> Geometry:
-    """Return camera, lens and pose of a frame, of which the entries may be anything."""
     expected = f"{place}: expected numbers of a camera and a pose of 4 x 4"
     with refusing(expected, ValueError, TypeError, KeyError, ArithmeticError):
         width, height = int(view.get("w", size[1])), int(view.get("h", size[0]))

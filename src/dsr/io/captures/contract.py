@@ -19,42 +19,22 @@ _HEAD = 1 << 20  # bytes at the beginning of a file in which its mark is
 
 @dataclass(frozen=True)
 class Capture:
-    """What is read of a device, program or data set, and what reads it.
-
-    Args:
-        name: of the device, program or data set.
-        export: what to export, or what its files are called.
-        found_by: what it is recognised by.
-        read: depth, and which of intrinsics, poses, confidence, distortion and time.
-        tried: the files that it was tried with: real ones, or ones that an independent program wrote.
-        faults: of the sensor; empty where any sensor may have been used.
-        source: address of the writer's own description or code.
-        of_folder: returns the frames of a folder; None if it is another one.
-        of_file: returns the frames of a file with one of the ``suffixes``.
-        suffixes: of captures that are a single file, in lower case; a folder may have several of them.
-        mark: tells such a file from others of its suffix; any file by default.
-        last: whether a folder is asked only if its files make no pairs, as of photos with depth maps beside them.
-        marks: patterns of paths below its folder, any of which distinguishes it from others; ``*`` in the last part
-            stands for anything. Empty for single files, and for layouts without characteristic names.
-        needs: patterns of its parts, alternatives as ``A or B``; those that match nothing are named to the user of a
-            folder that has a mark.
-
-    """
+    """What is read of a device, program or data set, and what reads it."""
 
     name: str
-    export: str
-    found_by: str
-    read: str
-    tried: str = ""
-    faults: str = ""
-    source: str = ""
-    of_folder: Callable[[Path], PairingResult | None] = lambda _: None
-    of_file: Callable[[Path], PairingResult] | None = None
-    suffixes: tuple[str, ...] = ()
-    mark: Callable[[Path], bool] = lambda _: True
-    last: bool = False
-    marks: tuple[str, ...] = ()
-    needs: tuple[str, ...] = ()
+    export: str  # what to export, or what its files are called
+    found_by: str  # what it is recognised by
+    read: str  # depth, and which of intrinsics, poses, confidence, distortion and time
+    tried: str = ""  # the files that it was tried with: real ones, or ones that an independent program wrote
+    faults: str = ""  # of the sensor; empty where any sensor may have been used
+    source: str = ""  # address of the writer's own description or code
+    of_folder: Callable[[Path], PairingResult | None] = lambda _: None  # the frames; None of another folder
+    of_file: Callable[[Path], PairingResult] | None = None  # the frames of a file with one of the suffixes
+    suffixes: tuple[str, ...] = ()  # in lower case, of captures that are a single file; a folder may have several
+    mark: Callable[[Path], bool] = lambda _: True  # tells such a file from others of its suffix
+    fallback: bool = False  # whether a folder is asked only if its files make no pairs
+    marks: tuple[str, ...] = ()  # patterns of paths in its folder, any of which distinguishes it; * in the last part
+    needs: tuple[str, ...] = ()  # patterns of its parts, "A or B"; a user is told which are missing beside a mark
 
     def frames(self, place: Path) -> PairingResult | None:
         """Return the frames of a file, of a folder, or of the files in a folder; None if it is another capture."""
@@ -62,11 +42,11 @@ class Capture:
         if place.is_file():
             if of_file is None or place.suffix.lower() not in self.suffixes:
                 return None
-            if not self.mark(place):
-                if self.last:
-                    return None
-                raise ValueError(f"{place}: expected {self.name}, got another {place.suffix} file")
-            return of_file(place)
+            if self.mark(place):
+                return of_file(place)
+            if self.fallback:
+                return None
+            raise ValueError(f"{place}: expected {self.name}, got another {place.suffix} file")
         found = self.of_folder(place)
         if found is not None or of_file is None:
             return found

@@ -79,7 +79,6 @@ def find_seven_scenes(folder: Path) -> PairingResult | None:
 
 
 def _seven_scenes(path: Path, camera: Path | None, size: Size) -> Geometry:
-    """Return the pose of a frame, and the camera that 7-Scenes names for photos of its aspect without a camera file."""
     if camera is not None or not same_aspect(size, (_KINECT.height, _KINECT.width)):
         return with_pose(None, path)
     text = "camera: 585 pixels and the centre 320, 240 assumed, which 7-Scenes names; its Kinects are not calibrated"
@@ -131,7 +130,6 @@ def find_replica(folder: Path) -> PairingResult | None:
 
 
 def _replica(found: Geometry, size: Size) -> Geometry:
-    """Return pose and camera of a rendering of which no file says the camera."""
     if not same_aspect(size, (_NICE_SLAM.height, _NICE_SLAM.width)):
         return found
     text = "camera: 600 pixels assumed, that of NICE-SLAM's renderings; there is no cam_params.json"

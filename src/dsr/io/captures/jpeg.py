@@ -11,7 +11,7 @@ import base64
 import contextlib
 import re
 from collections.abc import Iterator
-from functools import partial
+from functools import lru_cache, partial
 from io import BufferedReader, BytesIO
 from pathlib import Path
 
@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from dsr.io.captures.archive import decode_photo
-from dsr.io.frames import CaptureFrame, ConfidenceMap, Geometry, Part, accuracy_notes, stated
+from dsr.io.frames import CaptureFrame, ConfidenceMap, Geometry, Part, accuracy_notes, file_state, stated
 from dsr.io.pairs import Pair, PairingResult
 from dsr.io.photos import AS_STORED, read_exif
 from dsr.io.trajectories import intrinsics_camera
@@ -49,7 +49,7 @@ def read(path: Path) -> PairingResult:
     """Return the pair of a JPEG with a depth map."""
     confidence, found = b"", _Values()
     with contextlib.suppress(ValueError):  # which is reported with the frame
-        (_, _, confidence), found = _read(path)
+        (_, _, confidence), found = _read(path, file_state(path, "a photo"))
     model = {name: found[f"ImagingModel:{name}"] for name in _MODEL if f"ImagingModel:{name}" in found}
     names = ("Near", "Far", "Format", "Units", "MeasureType")
     values = {name: found.get(f"GDepth:{name}", found.get(f"DepthMap:{name}", "")).lower() for name in names}
@@ -74,7 +74,7 @@ def has_depth(path: Path) -> bool:
 
 
 def _fetch(path: Path, place: int) -> bytes:
-    return _read(path)[0][place]
+    return _read(path, file_state(path, "a photo"))[0][place]
 
 
 def _grey(content: bytes) -> np.ndarray:
@@ -97,7 +97,7 @@ def _depth(path: Path, values: _Values, content: bytes) -> np.ndarray:
         linear = kind == "rangelinear"
         depth = near + share * (far - near) if linear else 1 / (1 / near + share * (1 / far - 1 / near))
         depth = 1 / depth if values["Units"] == "diopters" else depth * _METRES.get(values["Units"], 1.0)
-    confidence = _read(path)[0][2]
+    confidence = _fetch(path, 2)
     if confidence and (sure := _grey(confidence)).shape == depth.shape:  # others are refused when confidence is read
         depth[sure < _NO_CONFIDENCE] = np.nan  # where Android writes near
     return depth.astype(np.float32)
@@ -114,7 +114,8 @@ def _segments(file: BufferedReader) -> Iterator[bytes]:
             file.seek(size, 1)
 
 
-def _read(path: Path) -> tuple[tuple[bytes, bytes, bytes], _Values]:
+@lru_cache(maxsize=1)
+def _read(path: Path, _state: tuple[int, int]) -> tuple[tuple[bytes, bytes, bytes], _Values]:
     """Return the encoded photo, depth map and confidence, and the properties of map and camera."""
     with opened(path) as file:
         expect_bytes(path, path.stat().st_size, MOST_FILE)

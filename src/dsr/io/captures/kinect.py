@@ -26,7 +26,7 @@ from dsr.io.captures.archive import as_pixels, decode_photo
 from dsr.io.frames import CaptureFrame, Geometry, Part, Record, Rig, Size, file_state, stated
 from dsr.io.pairs import PairingResult, Shot, pair_by_time
 from dsr.io.trajectories import describe_capture, intrinsics_camera
-from dsr.utils.guards import expect_pixels, expect_size, numbers_in, opened, refusing
+from dsr.utils.guards import expect_pixels, expect_size, numbers_in, refusing
 from dsr.utils.validation import Number, Whole, parse_model
 from dsr.utils.versions import how_to_install
 
@@ -63,17 +63,13 @@ class _Camera(BaseModel):
 
 
 class _Calibration(BaseModel):
-    """The attachment."""
-
     cameras: list[_Camera] = Field(validation_alias=AliasPath("CalibrationInformation", "Cameras"))
 
 
 @dataclass(frozen=True)
 class _Packet(Part):
-    """A frame of a recording, by its track and when it was taken in the track's unit."""
-
     track: int
-    time: int
+    time: int  # in the track's unit
 
     def record(self) -> Record:
         """Return the recording's name, the track's and the time, and a hash of the frame."""
@@ -149,7 +145,6 @@ def _track(path: Path, container: Any, role: str) -> Any:
 
 
 def _geometry(place: str, content: bytes, size: Size, size_lr: Size) -> Geometry:
-    """Return the cameras of a recording with photos and depth maps of (height, width)."""
     calibration = parse_model(_Calibration, content.rstrip(b"\0"), place, f"expected the calibration of {_APP}; ")
     cameras = {each.location: each for each in calibration.cameras}
     for location in (_COLOUR_CAMERA, _DEPTH_CAMERA):
@@ -207,6 +202,4 @@ def _open(path: Path, _state: tuple[int, int]) -> Any:
     """Return the open recording; FFmpeg only takes it apart, and decodes nothing."""
     import av  # noqa: PLC0415 - an extra
 
-    with opened(path) as file:
-        file.read(1)  # or the error names the file, such as that of a link to a device
     return av.open(str(path), format="matroska", options={"codec_whitelist": "rawvideo", "analyzeduration": "0"})

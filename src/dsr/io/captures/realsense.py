@@ -32,7 +32,6 @@ from dsr.utils.guards import naming, numbers_in
 from dsr.utils.progress import show_length
 
 VERSION = "/file_version"
-_OLDEST = 2
 _IMAGES = re.compile(
     r"(?P<stream>(?P<sensor>/device_\d+/sensor_\d+)/(?P<kind>\w+)_\d+)/image/data(/compressed(Depth)?)?"
 )
@@ -59,9 +58,6 @@ class _Stream(NamedTuple):
 
 def read(reader: Any, path: Path) -> PairingResult:
     """Return the frames of an open recording."""
-    version = int(first_message(reader, VERSION).data)
-    if version < _OLDEST:
-        raise ValueError(f"{path}: expected file_version {_OLDEST} or later of RealSense's SDK, got {version}")
     topics = {each.topic: match for each in reader.connections if (match := _IMAGES.fullmatch(each.topic))}
     color, depth = (_choose(reader, path, topics, kind) for kind in ("Color", "Depth"))
     unit, notes = _unit(reader, path, depth["sensor"])
@@ -154,7 +150,6 @@ def _entries(message: Any, expected: str) -> dict[str, str]:
 
 
 def _geometry(color: _Stream, depth: _Stream) -> tuple[Geometry, list[Assumption]]:
-    """Return the cameras of a recording, and how depth and photo belong together."""
     notes = (*color.notes, *depth.notes)
     geometry = Geometry(color.camera, None, notes, color.lens)
     if color.transform is None or depth.transform is None or color.reference != depth.reference:
@@ -168,7 +163,6 @@ def _geometry(color: _Stream, depth: _Stream) -> tuple[Geometry, list[Assumption
 
 
 def _unit(reader: Any, path: Path, sensor: str) -> tuple[float, list[Assumption]]:
-    """Return metres per value of the depth stream, and an assumption if it is not stated."""
     message = first_message(reader, f"{sensor}/option/Depth_Units/value")
     if message is not None:
         unit = numbers_in([str(message.data)])

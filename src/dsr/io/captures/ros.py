@@ -95,7 +95,6 @@ class _Topic(NamedTuple):
 
 
 def _topics(reader: Any) -> list[_Topic]:
-    """Return the topics of images that have messages, by name."""
     topics = []
     for name in sorted({each.topic for each in reader.connections if each.msgtype in (IMAGE, COMPRESSED)}):
         message = first_message(reader, name)
@@ -119,7 +118,6 @@ def _role(message: Any) -> str:
 
 
 def _choose(path: Path, topics: Sequence[_Topic]) -> tuple[_Topic, _Topic]:
-    """Return the topics of photos and depth, see the module's text."""
     photos, depths = ([each for each in topics if each.role == role] for role in ("rgb", "depth"))
     read = {f"photos ({', '.join(COLOURS)}, or CompressedImage)": photos, f"depth ({', '.join(DEPTHS)})": depths}
     for what, found in read.items():
@@ -195,8 +193,6 @@ def _transform(reader: Any, photo: _Topic, depth: _Topic) -> Matrix | None:
 
 
 class _Info(NamedTuple):
-    """What is read of a CameraInfo."""
-
     height: int
     width: int
     numbers: tuple[float, ...]  # fx, fy, cx, cy of (height, width) pixels
@@ -224,7 +220,6 @@ def _camera_info(reader: Any, topic: str, role: str) -> _Info | None:
 
 
 def _registered(path: Path, photo: _Topic, depth: _Topic) -> Geometry:
-    """Return the camera of a recording whose depth is in the photo's pixels."""
     found = _camera(path, photo)
     if _have_same_frame(photo, depth):
         return found
@@ -234,7 +229,6 @@ def _registered(path: Path, photo: _Topic, depth: _Topic) -> Geometry:
 
 
 def _apart(path: Path, photo: _Topic, depth: _Topic, motion: Matrix | None) -> Geometry:
-    """Return the cameras of a recording whose depth is not in the photo's pixels."""
     found = _camera(path, photo)
     own = Geometry() if motion is None else _camera(path, depth)
     if motion is None or own.camera is None:

@@ -97,7 +97,6 @@ def read_sens(path: Path) -> PairingResult:
 
 
 def _read_header(path: Path, file: BufferedReader) -> _Sens:
-    """Return the description at the beginning of a file, after checking it."""
     with refusing(f"{path}: expected a recording of ScanNet (.sens), got a damaged or foreign file", struct.error):
         version, length = _BEGINNING.unpack(file.read(_BEGINNING.size))
         if version != _VERSION or length > _LONGEST_NAME:
@@ -148,7 +147,6 @@ def find_export(folder: Path) -> PairingResult | None:
 
 
 def _export_geometry(matrices: list[Path], path: Path, size: Size) -> Geometry:
-    """Return the camera of the first matrix that fits the photo, else of photos as they are recorded, and the pose."""
     numbers = [read_numbers(each, 16)[[0, 5, 2, 6]].tolist() for each in matrices]
     for place, each in enumerate(numbers):
         with contextlib.suppress(ValueError):  # it is of other pixels
@@ -217,7 +215,6 @@ def find_scannetpp(folder: Path) -> PairingResult | None:
 
 
 def _parts(path: Path) -> dict[int, Part]:
-    """Return the maps of a file that has one after another."""
     size, place, found = path.stat().st_size, 0, dict[int, Part]()
     while place < size:
         length = int.from_bytes(read_section(path, place, 4), "little")

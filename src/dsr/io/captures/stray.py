@@ -37,7 +37,6 @@ _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _Row = Mapping[str, str]
 
-_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 _LARGEST = 1 << 25  # pixels of a frame, those of 8K; a decoder keeps many frames
 _LOCK = threading.Lock()
 
@@ -83,7 +82,6 @@ def frames_of_video(
 
 
 def _read_odometry(path: Path) -> dict[int, _Row]:
-    """Return the rows of the odometry by frame, with their values as text; empty without the file."""
     if not path.is_file():
         return {}
     with refusing(f"{path}: expected a table of {_APP}, got a damaged or foreign file", csv.Error):
@@ -168,17 +166,11 @@ class _Player:
         return cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
 
     def _open(self) -> None:
-        """Open the video at its first frame."""
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read once; its threads may print messages later
-        before = os.environ.get(_OPTIONS)
-        os.environ[_OPTIONS] = "ignore_editlist;1"  # decodes the frames that it hides: Stray Scanner's first one
-        try:
-            with QUIET_DECODERS:
-                self.capture, self._next = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG), 0
-        finally:
-            del os.environ[_OPTIONS]
-            if before is not None:
-                os.environ[_OPTIONS] = before
+        # decodes the frames that an edit list hides: Stray Scanner's first one
+        os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = "ignore_editlist;1"
+        with QUIET_DECODERS:
+            self.capture, self._next = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG), 0
         width, height = (self.capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if not self.capture.isOpened() or not width * height > 0:
             raise ValueError(f"{self._path}: expected a video, got a damaged or foreign file")
