@@ -78,9 +78,10 @@ def test_plane_is_reproduced_for_any_weights_and_photo(name, scale):
 def test_batch_equals_single_images_every_time(any_net):
     rgb, coarse = photos(80, 68, 3), maps(20, 17, 3)
     coarse[1, 0, 2, 3] = torch.nan
+    any_net.double()  # processors round sums of a batch differently, which random layers amplify
     together = any_net.upsample(rgb, coarse)
     alone = torch.cat([any_net.upsample(rgb[i : i + 1], coarse[i : i + 1]) for i in range(3)])
-    torch.testing.assert_close(together, alone, rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(together, alone, rtol=1e-6, atol=1e-6)
     assert torch.equal(any_net.upsample(rgb, coarse), together)
 
 

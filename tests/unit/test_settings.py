@@ -113,8 +113,8 @@ def test_setting_out_of_range_is_refused_by_its_key(build, key, value):
         (PrimalDualNetwork, {"width": 0}, "model"),
         (PrimalDualNetwork, {"layers": 1}, "model"),
         (DDRNet, {"scale": 4, "refinement": 6}, "model"),
-        (FacetsUNet, {"scale": 4, "width": 0}, "model"),
-        (FacetsUNet, {"scale": 4, "width": 8, "deep": 8, "blocks": 2}, "model"),
+        (FacetsUNet, {"scale": 4, "width": 0}, "width"),
+        (FacetsUNet, {"scale": 4, "width": 8, "deep": 8, "blocks": 2}, "blocks"),
     ],
 )
 def test_settings_that_do_not_go_together_are_refused(build, settings, key):
