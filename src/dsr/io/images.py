@@ -14,7 +14,7 @@ from pydantic import Field
 
 from dsr.notes import Assumption
 from dsr.utils.arrays import array_headers, read_arrays
-from dsr.utils.decoding import QUIET_DECODERS, decode_pixels, picture_size
+from dsr.utils.decoding import QUIET_DECODERS, decode_pixels, format_not_read, picture_size
 from dsr.utils.guards import (
     MOST_FILE,
     expect_pixels,
@@ -77,10 +77,11 @@ def read_map(path: Path, most: int | None = None) -> np.ndarray:
 def read_values(path: Path, most: int | None = None) -> np.ndarray:
     """Return a map in the type that it is stored in, (H, W), floats or whole numbers of 16 bits or more."""
     values = read_array(path, most)
+    what = f": {_describe_picture(values)}" if values.dtype in (np.uint8, np.uint16) else ""
     if values.ndim != 2:
-        raise ValueError(f"{path}: expected one channel (height x width), got shape {values.shape}")
+        raise ValueError(f"{path}: expected one channel (height x width), got shape {values.shape}{what}")
     if values.dtype.kind not in "fiu" or (values.dtype.kind in "iu" and values.dtype.itemsize == 1):
-        raise ValueError(f"{path}: expected 16 bits or floats, got {values.dtype} (too coarse for depth)")
+        raise ValueError(f"{path}: expected 16 bits or floats, got {values.dtype} (too coarse for depth){what}")
     return values
 
 
@@ -93,6 +94,19 @@ def read_array(path: Path, most: int | None = None) -> np.ndarray:
     if most is not None and values.ndim > 1:
         expect_pixels(path, values.shape[0], values.shape[1], most)
     return values
+
+
+def _describe_picture(values: np.ndarray) -> str:
+    """Describe what a picture of several channels, or of 8 bits, probably shows."""
+    if values.ndim == 2:
+        return "a picture for viewing, or disparities of an old benchmark"
+    if values.ndim == 3 and values.shape[2] == 2:
+        return "grey that is transparent in places"
+    if values.ndim != 3 or values.shape[2] not in (3, 4) or not values.size:
+        return "no map"
+    if (values[..., :3] == values[..., :1]).all():
+        return "three equal channels, a grey picture for viewing"
+    return "a picture in colour, a photo or a map coloured for viewing"
 
 
 def read_levels(path: Path) -> np.ndarray:
@@ -207,6 +221,8 @@ def read_pixels(path: Path, flags: int, most: int | None = None) -> np.ndarray:
     content = _content(path)
     pixels = decode_pixels(path, content, flags, most)
     if pixels is None:
-        expected = "a picture as PNG, JPEG, TIFF, BMP, WebP or PNM"
-        raise ValueError(f"{path}: expected {expected}, got a damaged or foreign file of {len(content)} bytes")
+        kind = format_not_read(content, stored=flags == cv2.IMREAD_UNCHANGED)
+        if kind:
+            raise ValueError(f"{path}: expected PNG, JPEG, TIFF, BMP, WebP or PNM, got {kind}, which is not read here")
+        raise ValueError(f"{path}: expected a picture, got a damaged or foreign file of {len(content)} bytes")
     return pixels

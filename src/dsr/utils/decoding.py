@@ -25,7 +25,7 @@ from dsr.utils.guards import expect_pixels, pixels_of_file
 # Photometric interpretations of TIFF: a mosaic of colours, and linear raw values; GDAL's tag, a number as text.
 _RAW, _GDAL_NODATA = (32803, 34892), 42113
 _PNG, _GREY_AND_OPACITY = b"\x89PNG\r\n\x1a\n", 4  # colour type of PNG
-_ORIENTATION, _TAGS = 274, {254, 255, 256, 257, 262, 274, 330, 42113}
+_ORIENTATION, _TAGS = 274, {254, 255, 256, 257, 258, 259, 262, 274, 330, 339, 42113}
 _TAG_TYPES = {1: "B", 2: "B", 3: "H", 4: "I", 13: "I", 16: "Q", 18: "Q"}
 _MOST_TAGS, _MOST_VALUES, _MOST_PAGES = 4096, 64, 64
 # Their classes, as Image.open warns of photos of 90 megapixels.
@@ -173,3 +173,27 @@ def tiff_pages(file: IO[bytes]) -> list[TiffPage]:
                 pages.append(TiffPage(at, orientation_at, tags))
             ahead += [*tags.get(330, ()), *read(start + step * count, word)]
     return [page for page in pages if not page.tags.get(254, (0,))[0] & ~2 and page.tags.get(255) != (2,)] or pages
+
+
+_NOT_READ = {
+    b"#?": "Radiance HDR", b"v/1\x01": "OpenEXR", b"\x93NUMPY": "a NumPy array", b"PK\3\4": "an archive", b"PF": "PFM",
+    b"GIF8": "GIF", b"8BPS": "Photoshop", b"%PDF": "PDF", b"P7": "PAM", b"Pf": "PFM", b"\xff\x0a": "JPEG XL",
+    b"\0\0\0\x0cJXL ": "JPEG XL", b"\0\0\0\x0cjP  ": "JPEG 2000", b"\xff\x4f\xff\x51": "JPEG 2000",
+    b"FUJIFILM": "a raw photo", b"IIU\0": "a raw photo",
+}  # fmt: skip
+_BRANDS = {b"avi": "AVIF", b"hei": "HEIC", b"hev": "HEIC", b"mif": "HEIC", b"crx": "a raw photo"}
+_COMPRESSIONS = {1, 5, 6, 7, 8, 32773, 32946}  # of TIFF, which OpenCV reads
+
+
+def format_not_read(content: bytes, *, stored: bool) -> str:
+    """Return what a picture is that OpenCV cannot decode, in 8 bits or as ``stored``; empty if damaged or unknown."""
+    if content[4:8] == b"ftyp":
+        return _BRANDS.get(content[8:11], "a video")
+    if content[:2] in (b"II", b"MM") and picture_size(io.BytesIO(content)) is not None:
+        tags = tiff_pages(io.BytesIO(content))[0].tags
+        bits, floats, compression = tags.get(258, (1,))[0], tags.get(339, (1,))[0] == 3, tags.get(259, (1,))[0]
+        if compression not in _COMPRESSIONS:
+            return f"a TIFF with compression {compression}"
+        if (bits > 16 and not stored) or (bits < 32 and floats):
+            return f"a TIFF of {bits}-bit {'floats' if floats else 'values'}"
+    return next((name for magic, name in _NOT_READ.items() if content.startswith(magic)), "")
