@@ -55,6 +55,15 @@ def test_signal_meets_a_step_only_at_its_end_and_a_second_one_kills(tmp_path: Pa
     assert run(tmp_path, step, signal.SIGTERM, signal.SIGTERM) == (-signal.SIGTERM, "")
 
 
+def test_output_that_nobody_reads_ends_the_command_without_a_word(tmp_path: Path) -> None:
+    (tmp_path / "case.py").write_text("def main():\n    for _ in range(30000): print('a line')\n")
+    program = "from dsr.utils.interruption import start; start('case', 'main')"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    line = f"set -o pipefail; '{sys.executable}' -c \"{program}\" | true"
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, env=environment, check=False)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
 def test_signals_of_the_host_process_are_its_own_again_after_a_deferral() -> None:
     before = signal.getsignal(signal.SIGTERM)
     with interruption.deferred() as noted:

@@ -102,15 +102,16 @@ def test_holes_are_filled_by_what_others_see_and_stay_without():
 
 
 @pytest.mark.parametrize(
-    ("own", "message"),
+    ("depth", "own", "message"),
     [
-        (np.diag([2.0, 2.0, 2.0, 1.0]), "pose: expected a rigid transform"),
-        (np.full((4, 4), np.nan), "pose: expected finite numbers"),
+        (torch.ones(1, 72, 95), np.eye(4), "depth: expected shape"),
+        (torch.ones(1, 72, 96), np.diag([2.0, 2.0, 2.0, 1.0]), "pose: expected a rigid transform"),
+        (torch.ones(1, 72, 96), np.full((4, 4), np.nan), "pose: expected finite numbers"),
     ],
 )
-def test_invalid_views_are_refused(own, message):
+def test_invalid_views_are_refused(depth, own, message):
     with pytest.raises(ValueError, match=message):
-        View(torch.ones(1, 72, 96), CAMERA, own)
+        View(depth, CAMERA, own)
 
 
 SMALL = Camera.centred(64, 48, 52.0)

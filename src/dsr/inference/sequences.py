@@ -38,6 +38,9 @@ class View:
     pose: Matrix  # from the camera's frame (x right, y down, z forward) to the world's, 4 x 4, metres
 
     def __post_init__(self) -> None:
+        shape = (1, self.camera.height, self.camera.width)
+        if tuple(self.depth.shape) != shape:
+            raise ValueError(f"depth: expected shape {shape}, the camera's, got {tuple(self.depth.shape)}")
         object.__setattr__(self, "pose", as_rigid(self.pose, "pose"))
 
     @functools.cached_property

@@ -1,6 +1,7 @@
 """Exit codes, the console and the progress display of all commands."""
 
 import contextlib
+import errno
 import functools
 import io
 import sys
@@ -17,6 +18,7 @@ from rich.text import Text
 from dsr.utils.progress import Item, Progress, Task, Unit, clock, megabytes
 
 USAGE_ERROR = 2
+_OUTPUT = {errno.ENOSPC, errno.EPIPE}  # errors without a file's name that are those of printing
 _LONGEST = 1000  # characters of an error's line
 _TURNING = "\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"  # characters that turn the direction of text
 _LOG_WIDTH = 110  # columns where the output is not a terminal
@@ -66,6 +68,8 @@ def printable(text: str) -> str:
 
 def one_line(error: BaseException) -> str:
     """Return an error's message on one line."""
+    if isinstance(error, OSError) and error.filename is None and error.errno in _OUTPUT:
+        return f"standard output: expected to be writable, got: {error.strerror}"
     return shorten(printable(" ".join(str(error).split()))) or type(error).__name__
 
 
