@@ -127,6 +127,8 @@ def warp_depth(depth: Tensor, camera: Camera, transforms: Tensor, target: Camera
     batch, size = depth.shape[0], (camera.height, camera.width)
     if min(size) < 2:
         raise ValueError(f"depth: expected a map of at least 2 x 2 pixels, got {size[0]} x {size[1]}")
+    if depth.dim() != 4 or tuple(depth.shape[1:]) != (1, *size):
+        raise ValueError(f"depth: expected shape (B, 1, {size[0]}, {size[1]}), got {tuple(depth.shape)}")
     inverse = depth[:, 0].double().reciprocal()  # (B, h, w)
     inverse = torch.where(inverse.isfinite() & (inverse > 0), inverse, torch.nan)
     transforms = transforms.to(inverse).expand(batch, 4, 4)

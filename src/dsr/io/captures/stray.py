@@ -37,6 +37,7 @@ _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _Row = Mapping[str, str]
 
+_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 _LARGEST = 1 << 25  # pixels of a frame, those of 8K; a decoder keeps many frames
 _LOCK = threading.Lock()
 
@@ -167,10 +168,15 @@ class _Player:
 
     def _open(self) -> None:
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read once; its threads may print messages later
-        # decodes the frames that an edit list hides: Stray Scanner's first one
-        os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = "ignore_editlist;1"
-        with QUIET_DECODERS:
-            self.capture, self._next = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG), 0
+        before = os.environ.get(_OPTIONS)
+        os.environ[_OPTIONS] = "ignore_editlist;1"  # decodes the frames that it hides: Stray Scanner's first one
+        try:
+            with QUIET_DECODERS:
+                self.capture, self._next = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG), 0
+        finally:
+            del os.environ[_OPTIONS]
+            if before is not None:
+                os.environ[_OPTIONS] = before
         width, height = (self.capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if not self.capture.isOpened() or not width * height > 0:
             raise ValueError(f"{self._path}: expected a video, got a damaged or foreign file")
