@@ -129,6 +129,8 @@ def warp_depth(depth: Tensor, camera: Camera, transforms: Tensor, target: Camera
         raise ValueError(f"depth: expected a map of at least 2 x 2 pixels, got {size[0]} x {size[1]}")
     if depth.dim() != 4 or tuple(depth.shape[1:]) != (1, *size):
         raise ValueError(f"depth: expected shape (B, 1, {size[0]}, {size[1]}), got {tuple(depth.shape)}")
+    if transforms.dim() != 3 or tuple(transforms.shape[1:]) != (4, 4) or len(transforms) not in (1, batch):
+        raise ValueError(f"transforms: expected shape ({batch}, 4, 4), got {tuple(transforms.shape)}")
     inverse = depth[:, 0].double().reciprocal()  # (B, h, w)
     inverse = torch.where(inverse.isfinite() & (inverse > 0), inverse, torch.nan)
     transforms = transforms.to(inverse).expand(batch, 4, 4)

@@ -150,8 +150,9 @@ class AnyRatio(Method):
         """Upsample a depth map, (1, h, w) in metres with NaN in holes, to the size of a photo, (3, H, W) in [0, 1].
 
         Both are registered: the same view and field of view, outer edge on outer edge; the camera is the photo's. The
-        depth is (1, H, W) float32, as its errors on the device of ``depth``. ``facets`` states the expected errors; for
-        other methods they are estimated, see :mod:`dsr.inference.plausibility`, unless not ``estimate_errors``.
+        result has depth, (1, H, W) float32 in metres, its expected errors, which depth is filled in, all on the device
+        of ``depth``, and the map's outliers. ``facets`` states the expected errors; for other methods they are
+        estimated, see :mod:`dsr.inference.plausibility`, unless not ``estimate_errors``.
 
         ``sensor``: what measured the map: of :func:`~dsr.inference.find_sensor`, or its argument; None for none. No
         expected error is less than what remains of the sensor's least noise, and a systematic error of which its maker
